@@ -59,8 +59,6 @@ class Settings:
         batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at the limit it reaches first.
         fold_worker_restart_s: the daemon waits this long before it restarts a fold worker that died; the wait doubles
             after each further death, up to a minute.
-        fold_worker_answer_s: a fold worker that has not answered for this long is killed and replaced. A batch takes
-            about a second, so this limit catches endless loops and stopped processes, not slow disks.
         idle_ms: a plan that has emitted no event for this long counts as idle, and its events are folded.
         fold: the writer thread folds when the plan idles ("idle"), or only at a flush and at the end of the memory
             ("at_end"): for an executive that sleeps often, because the fold competes with it for the interpreter.
@@ -95,7 +93,6 @@ class Settings:
     batch_bytes_max: int = 4 * 2**20
     batch_age_ms: int = 50
     fold_worker_restart_s: float = 1.0
-    fold_worker_answer_s: float = 300.0
     idle_ms: int = 200
     fold: Fold = "idle"
     recall: bool = True

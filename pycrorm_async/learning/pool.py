@@ -3,7 +3,7 @@
 Theory of operation
 -------------------
 
-The caller's process holds a `Workers` object, one `_Worker` per worker process, and one task that runs the daemon. Each
+The caller's process holds a `Workers` object, one `ChildProcess` per worker, and one task that runs the daemon. Each
 worker process is forked from a fork server (`operations.workers`) and connected by one pipe. With a `MemoryLocation`
 each worker opens a memory with ``writer="daemon"``: it writes to its own folder in the spool, and the daemon task
 drains all of them into the database. Without one nothing is recorded, and no daemon runs; the rollouts are the same.
@@ -36,9 +36,10 @@ import contextvars
 import logging
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Self
@@ -55,8 +56,6 @@ ROLLOUTS_PER_RUN = 500
 """Rollouts in one run of a worker, which is one episode: enough to make the cost of building the world negligible."""
 _PROGRESS_INTERVAL_S = 0.2
 """The shortest time in s between two reports of progress."""
-_POLL_INTERVAL_S = 0.02
-"""The pause in s between two looks at the results of the workers."""
 _TAKEOVER_INTERVAL_S = 1.0
 """Time between attempts to drain the spool while another daemon drains it."""
 SETTINGS = Settings(flush_timeout_s=120)
@@ -107,18 +106,18 @@ class Workers:
             raise CallerError(f"worker count must be >= 1, got {count}")
         self._count = count
         self._place = place
-        self._workers: list[_Worker] = []
+        self._processes: list[ChildProcess] = []
+        self._daemon: list[asyncio.Task[None]] = []
         self._is_free = False
         self._stack = AsyncExitStack()
-        self._check_daemon: Callable[[], None] = lambda: None
 
     async def __aenter__(self) -> Self:
         try:
             if self._place is not None:
-                self._check_daemon = await self._stack.enter_async_context(_run_daemon(self._place))
+                self._daemon.append(await self._stack.enter_async_context(_run_daemon(self._place)))
             for _ in range(self._count):
                 process = ChildProcess.start(_run_worker, "pycrorm rollouts", self._place, dies_with_parent=False)
-                self._workers.append(_Worker(process))
+                self._processes.append(process)
             self._is_free = True
         except BaseException:
             await self._close()
@@ -131,10 +130,10 @@ class Workers:
     async def _close(self) -> None:
         """Close the pipes, wait until the workers have closed their memories and exited, then stop the daemon."""
         self._is_free = False
-        for worker in self._workers:
-            worker.close()
-        for worker in self._workers:
-            await asyncio.to_thread(worker.join)
+        for process in self._processes:
+            process.connection.close()
+        for process in self._processes:
+            await asyncio.to_thread(process.process.join)
         await self._stack.aclose()
 
     async def roll_out(
@@ -152,75 +151,61 @@ class Workers:
             raise CallerError("workers do one job at a time, and none after an interrupted job: start new workers")
         self._is_free = False
         pending_runs = iter(runs)
-        tallies = {worker: Tally() for worker in self._workers}
-        ended = Tally()
-        for worker in self._workers:
-            worker.send(("job", job))
-        busy = {worker for worker in self._workers if worker.send_run(next(pending_runs, None))}
+        tallies: dict[tuple[int, int], Tally] = {}
+
+        def note(run: tuple[int, int], tally: Tally) -> None:
+            tallies[run] = tally
+            report(sum(tallies.values(), Tally()))
+
+        async def work(process: ChildProcess) -> None:
+            with suppress(OSError):  # of a dead worker: `_answer` raises `WorkerLost`
+                process.connection.send(("job", job))
+            for run in pending_runs:
+                note(run, await _answer(process, ("run", run), partial(note, run)))
+
         try:
-            while busy:
-                for worker in [each for each in busy if each.has_message]:
-                    kind, tally = worker.receive()
-                    tallies[worker] = tally
-                    if kind == "done":
-                        ended, tallies[worker] = ended + tally, Tally()
-                        if not worker.send_run(next(pending_runs, None)):
-                            busy.discard(worker)
-                    report(sum(tallies.values(), ended))
-                self._check_daemon()
-                await asyncio.sleep(_POLL_INTERVAL_S)
+            await self._each(work)
         except BaseException:
-            for worker in busy:
-                worker.send(("stop", None))
+            for process in self._processes:
+                with suppress(OSError):  # of a dead worker
+                    process.connection.send(("stop", None))
             raise
         if job.recorded:
-            await self._flush()
+            await self._each(lambda process: _answer(process, ("flush", None)))
         self._is_free = True
-        return ended
+        return sum(tallies.values(), Tally())
 
-    async def _flush(self) -> None:
-        for worker in self._workers:
-            worker.send(("flush", None))
-        for worker in self._workers:
-            while not worker.has_message:
-                self._check_daemon()
-                await asyncio.sleep(_POLL_INTERVAL_S)
-            worker.receive()
-
-
-class _Worker:
-    """One worker process and the parent's end of its pipe."""
-
-    def __init__(self, process: ChildProcess) -> None:
-        self._process = process
-        self._pipe = process.connection
-        self.close = self._pipe.close
-        self.join = process.process.join
-
-    @property
-    def has_message(self) -> bool:
-        return self._pipe.poll()
-
-    def send(self, message: tuple[str, Any]) -> None:
-        with suppress(OSError):  # a dead worker: the next `receive` raises WorkerLost
-            self._pipe.send(message)
-
-    def send_run(self, run: tuple[int, int] | None) -> bool:
-        """Send the run, if there is one, and return whether there was one."""
-        if run is not None:
-            self.send(("run", run))
-        return run is not None
-
-    def receive(self) -> tuple[str, Tally]:
+    async def _each(self, work: Callable[[ChildProcess], Coroutine[Any, Any, object]]) -> None:
+        """Do this with each worker; raise the first error of one, or of the daemon."""
+        working = {asyncio.create_task(work(each), name=f"pycrorm rollouts {each.pid}") for each in self._processes}
         try:
-            kind, answer = self._pipe.recv()
-        except (EOFError, OSError):
-            self.join()
-            ending = _describe_exit(self._process.process.exitcode)
-            raise WorkerLost(f"a rollout worker {ending}; its finished rollouts are recorded") from None
-        if kind == "failed":
-            raise WorkerLost(f"a rollout worker failed: {answer}; its finished rollouts are recorded")
-        return kind, answer
+            while working:
+                done, _ = await asyncio.wait([*working, *self._daemon], return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+                working -= done
+        finally:
+            for task in working:
+                task.cancel()
+
+
+async def _answer(
+    process: ChildProcess, message: tuple[str, Any], report: Callable[[Tally], None] = lambda _: None
+) -> Tally:
+    """Send a message and return the answer; `report` receives the results so far. Raises `WorkerLost`."""
+    try:
+        kind, answer = await process.exchange(message)
+        while kind == "so far":
+            report(answer)
+            kind, answer = await process.receive()
+    except (EOFError, OSError):
+        process.process.join()
+        ending = _describe_exit(process.process.exitcode)
+        raise WorkerLost(f"a rollout worker {ending}; its finished rollouts are recorded") from None
+    if kind == "failed":
+        raise WorkerLost(f"a rollout worker failed: {answer}; its finished rollouts are recorded")
+    assert isinstance(answer, Tally)
+    return answer
 
 
 def _describe_exit(code: int | None) -> str:
@@ -230,27 +215,23 @@ def _describe_exit(code: int | None) -> str:
 
 
 @asynccontextmanager
-async def _run_daemon(place: MemoryLocation) -> AsyncIterator[Callable[[], None]]:
+async def _run_daemon(place: MemoryLocation) -> AsyncIterator[asyncio.Task[None]]:
     """Drain the workers' recorders until the context ends, except while another daemon drains the spool.
 
-    Yields a function that raises the exception that ended the daemon, if one did. Raises as `serve` does.
+    Yields the task of the daemon, which ends early only with an error. Raises as `serve` does.
     """
     stop, ready = asyncio.Event(), asyncio.Event()
-
-    def check() -> None:
-        if task.done():
-            task.result()
-
     task = asyncio.create_task(_drain(place, stop, ready), name="pycrorm daemon")
     task.add_done_callback(lambda _: ready.set())
     try:
         await ready.wait()
-        check()
-        yield check
+        if task.done():
+            task.result()
+        yield task
     finally:
         stop.set()
         await asyncio.wait([task])
-        check()
+        task.result()
 
 
 async def _drain(place: MemoryLocation, stop: asyncio.Event, ready: asyncio.Event) -> None:

@@ -3,7 +3,7 @@
 **Processes.** Start child processes, each with a connection to its parent, and report how they ended.
 
     child = ChildProcess.start(serve_requests, "pycrorm fold worker")
-    answer = child.exchange(request)
+    answer = await child.exchange(request)
 
 Theory of operation. There are three ways to start a process. The `pycrorm writer` command forks its first fold workers
 before it opens anything, while it has a single thread: they have imported all modules and are ready at once, so a full
@@ -76,9 +76,9 @@ from pycrorm_async.writer.drain import Backoff, TablesPort
 # worker's state is `idle` (not needed yet), `starting`, `running` or `restarting`; only its task and the calls that
 # wait for its answers change it, all in the parent's event loop.
 #
-# A process that does not answer for `fold_worker_answer_s`, because it loops, or because it was stopped inside a
-# transaction and keeps locks of the database, is killed; the database then rolls the transaction back. The parent kills
-# only processes that it started and has not reaped, so a reused pid is never hit.
+# A worker that loops or is stopped (SIGSTOP) is not replaced: `pycrorm status` shows its pid and the events that wait,
+# and another one takes its place when it is killed. The parent kills only processes that it started and has not reaped,
+# so a reused pid is never hit.
 
 _RESTART_S_MAX: Final = 60.0
 """The longest pause before a restart."""
@@ -140,7 +140,7 @@ class FoldWorker:
         self._clock = clock
         self._forked = forked
         self._process: ChildProcess | None = None
-        self._killed_because: str | None = None
+        self._fault: str | None = None
         self._changed = asyncio.Event()
 
     async def started(self, *, restarts_max: int) -> bool:
@@ -153,30 +153,30 @@ class FoldWorker:
     # --- requests ---------------------------------------------------------------------------------------------
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
-        answer = await self._request(Prepare(spans), "prepares a batch")
+        answer = await self._request(Prepare(spans))
         assert isinstance(answer, BatchPreview)
         return answer
 
     async def write(self) -> int:
-        count = await self._request(Write(), "writes a batch and holds locks of the database")
+        count = await self._request(Write())
         assert isinstance(count, int)
         self._change(batches=self.state.batches + (count > 0))
         return count
 
     async def fold_rest(self, *, now: bool) -> bool:
         """Refresh materialised views and fold custom projections by one step; return False if none was behind."""
-        return bool(await self._request(FoldRest(now), "folds views or projections and may hold locks of the database"))
+        return bool(await self._request(FoldRest(now)))
 
     async def fold_share(self, share: Share) -> int | None:
         """Fold a batch of this share of a rebuild; return the number of its events, None when none is left."""
-        count = await self._request(FoldShare(share), "writes a batch and holds locks of the database")
+        count = await self._request(FoldShare(share))
         assert count is None or isinstance(count, int)
         return count
 
-    async def _request(self, request: Request, activity: str) -> object:
+    async def _request(self, request: Request) -> object:
         if self._process is None or not self.is_ready:
             raise FoldWorkerLost
-        answer = await self._exchange(self._process, request, activity)
+        answer = await self._exchange(self._process, request)
         if isinstance(answer, Failure):
             raise (DatabaseUnavailable if answer.unavailable else DatabaseError)(answer.reason)
         return answer
@@ -219,44 +219,34 @@ class FoldWorker:
             await asyncio.gather(opening, return_exceptions=True)
             process.end()
         cause = f"exited with signal {-code}" if code < 0 else f"exited with exit code {code}"
-        reason, self._killed_because = self._killed_because or cause, None
+        reason, self._fault = self._fault or cause, None
         return f"{name} (pid {process.pid})", reason
 
     async def _open(self, process: ChildProcess) -> None:
         try:
-            await self._exchange(process, self._assignment, "starts")
+            await self._exchange(process, self._assignment)
         except FoldWorkerLost:
             return
         except Exception as error:  # noqa: BLE001 - such as a projection that cannot be pickled; reported at restart
-            self._killed_because = f"cannot receive its assignment: {error}"
-            process.kill()
+            self._fault = f"cannot receive its assignment: {error}"
             return
         self._process, self.is_ready = process, True
         self._change("running")
 
-    async def _exchange(self, process: ChildProcess, message: object, activity: str) -> Any:
-        """Send a message and return the answer; kill a process that gives none. Raises `FoldWorkerLost`.
+    async def _exchange(self, process: ChildProcess, message: object) -> Any:
+        """Send a message and return the answer. Raises `FoldWorkerLost`.
 
-        Cancelling it kills the process, because the late answer would be taken for that of the next request.
+        A process that gives none is killed, also when this is cancelled: its late answer would be taken for that of
+        the next request.
         """
-        exchange = asyncio.ensure_future(asyncio.to_thread(process.exchange, message))
-        limit_s = self._settings.fold_worker_answer_s
         try:
-            if not (await asyncio.wait([exchange], timeout=limit_s))[0]:
-                self._killed_because = f"gave no answer for {limit_s:.0f} s while it {activity}, and was killed"
-                self.is_ready = False
-                process.kill()
-            answer = await exchange
-        except (EOFError, OSError):
+            return await process.exchange(message)
+        except BaseException as fault:
             self.is_ready = False
-            process.kill()  # without a connection it could only idle
-            raise FoldWorkerLost from None
-        except asyncio.CancelledError:
-            self.is_ready = False
-            exchange.add_done_callback(lambda done: done.cancelled() or done.exception())
             process.kill()
+            if isinstance(fault, EOFError | OSError):
+                raise FoldWorkerLost from None
             raise
-        return answer
 
     def _change(self, state: str | None = None, **values: object) -> None:
         if state is not None:
@@ -457,20 +447,19 @@ class ChildProcess(NamedTuple):
         assert self.process.pid is not None, "started"
         return self.process.pid
 
-    def exchange(self, message: object) -> Any:
-        """Send a message and return the answer. Blocks; raises `EOFError` or `OSError` when the process ends."""
+    async def exchange(self, message: object) -> Any:
+        """Send a message and return the answer. Raises `EOFError` or `OSError` when the process ends."""
         self.connection.send(message)
+        return await self.receive()
+
+    async def receive(self) -> Any:
+        """Return the next message. Raises `EOFError` or `OSError` when the process ends."""
+        await _readable(self.connection.fileno())
         return self.connection.recv()
 
     async def ended(self) -> int:
         """Wait for the end of the process; return its exit code, which is negative for a signal."""
-        ended = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        loop.add_reader(self.process.sentinel, ended.set)
-        try:
-            await ended.wait()
-        finally:
-            loop.remove_reader(self.process.sentinel)
+        await _readable(self.process.sentinel)
         self.process.join()
         assert self.process.exitcode is not None
         return self.process.exitcode
@@ -485,6 +474,17 @@ class ChildProcess(NamedTuple):
         self.kill()
         self.process.join()
         self.connection.close()
+
+
+async def _readable(descriptor: int) -> None:
+    """Wait until a file descriptor can be read, or has come to its end."""
+    readable = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    loop.add_reader(descriptor, readable.set)
+    try:
+        await readable.wait()
+    finally:
+        loop.remove_reader(descriptor)
 
 
 class _Entry(NamedTuple):
@@ -537,8 +537,6 @@ def _run(
 
 WORKERS: Final = 2
 """The fold workers of one daemon: one writes while the other prepares. More would compete for the database's writes."""
-_NOTE_S: Final = 1.0
-"""The longest delay of a note of the number of batches; a change of state is noted at once."""
 
 
 class DaemonNote(msgspec.Struct, frozen=True):
@@ -569,8 +567,6 @@ class FoldWorkers:
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._note_all = note
-        self._noted: list[object] = []
-        self._later: asyncio.TimerHandle | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._workers: list[FoldWorker] = []
         for number, first in zip(range(1, count + 1), [*forked, *[None] * count], strict=False):
@@ -591,8 +587,6 @@ class FoldWorkers:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self._later is not None:
-            self._later.cancel()
 
     def __iter__(self) -> Iterator[FoldWorker]:
         return iter(self._workers)
@@ -613,17 +607,6 @@ class FoldWorkers:
             worker.wanted.set()
 
     def _note(self) -> None:
-        """Note the states now if one has changed, otherwise the number of batches a little later."""
-        states = [each.state for each in self._workers]
-        key: list[object] = [(each.state, each.since_wall_ns, each.pid) for each in states]
-        if key != self._noted:
-            self._noted = key
-            self._note_all(states)
-        elif self._later is None:
-            self._later = asyncio.get_running_loop().call_later(_NOTE_S, self._note_batches)
-
-    def _note_batches(self) -> None:
-        self._later = None
         self._note_all([each.state for each in self._workers])
 
 

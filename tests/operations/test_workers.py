@@ -10,7 +10,7 @@ import signal
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -238,7 +238,7 @@ class Trapped(Projection):
 
 
 def arm(trap: Path, word: str) -> None:
-    """Set the fault: a signal's name, `exit`, `raise` or `hang`."""
+    """Set the fault: a signal's name, `exit` or `raise`."""
     trap.with_suffix(".making").write_text(word)
     trap.with_suffix(".making").rename(trap)
 
@@ -255,8 +255,6 @@ def _spring() -> None:
             os._exit(3)
         case "raise":
             raise MemoryError("no memory left")
-        case "hang":
-            time.sleep(3600)
         case _:
             os.kill(os.getpid(), signal.Signals[word])
 
@@ -305,8 +303,6 @@ def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -
 # The daemon runs in this loop; its one worker is a process of its own, which is forked instead of spawned.
 
 PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1)
-HURRIED = replace(PATIENT, fold_worker_answer_s=10.0)
-"""The limit on the start of a worker, which takes a few seconds on a busy machine."""
 NOTES = 10
 
 
@@ -434,23 +430,6 @@ async def test_status_keeps_the_batch_count_of_a_worker_that_has_ended(
         async with asyncio.timeout(20):
             while lab.worker().batches < before + 3:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
-
-
-@pytest.mark.usefixtures("forked_workers")
-@pytest.mark.parametrize("trap", ["hang", "SIGSTOP"])
-async def test_a_worker_that_never_answers_is_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trap: str
-) -> None:
-    async with lab_at(f"sqlite:///{tmp_path}/memory.db", tmp_path, HURRIED, monkeypatch) as lab:
-        pid = lab.worker().pid
-        arm(lab.trap, trap)
-        await lab.write()
-        assert re.fullmatch(
-            rf"fold worker 1 \(pid {pid}\) gave no answer for 10 s while it writes a batch and holds locks of the"
-            r" database, and was killed; restarting it in 0\.1 s",
-            await lab.wait_for_line("restarting"),
-        )
-        await lab.worker_is("running", restarts=1)
 
 
 @pytest.mark.usefixtures("forked_workers")
