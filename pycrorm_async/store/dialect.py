@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, contextmanager
 from functools import cached_property
 from itertools import chain
 from typing import Any, ClassVar, NamedTuple, TypeAlias
@@ -37,13 +37,6 @@ LOG_CHANGES = 7266203370152417861
 """Key of the lock that creations and migrations of a log, and changes of its tables, take. It encodes our name."""
 DECLARATIONS = LOG_CHANGES + 2
 """Key of the lock that transactions with new declarations take."""
-
-
-class Birth(NamedTuple):
-    """The identity of a new log: its id, a UUID as text, and its creation time."""
-
-    log_id: str
-    created_wall_ns: int
 
 
 class LogIdentity(NamedTuple):
@@ -316,3 +309,13 @@ class Dialect(ABC):
     @abstractmethod
     def translate_error(self, error: Exception, name: str) -> PycrormError:
         """Return the error of this package to raise instead."""
+
+    @contextmanager
+    def translated(self, name: str) -> Iterator[None]:
+        """Translate driver errors raised inside to errors of this package, which name this database."""
+        try:
+            yield
+        except PycrormError:
+            raise
+        except self.faults as error:
+            raise self.translate_error(error, name) from error

@@ -14,8 +14,8 @@ import os
 import sqlite3
 import stat
 import uuid
-from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, contextmanager, nullcontext
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -25,7 +25,7 @@ from sqlalchemy import ColumnElement, Executable, Select, func, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, UnknownEpisode
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, is_episode_id
@@ -40,7 +40,7 @@ from pycrorm_async.store.append import (
     events_warning,
     number_warning,
 )
-from pycrorm_async.store.dialect import Birth, Dialect, LogIdentity, Migrations, Progress, StoredOn
+from pycrorm_async.store.dialect import LogIdentity, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
 from pycrorm_async.store.stored import (
@@ -108,27 +108,23 @@ class EventLog:
         engine = address.engine(read_only=not create, busy_timeout_s=busy_timeout_s)
         name = str(address)
         try:
-            with _translated(dialect_of(engine), name):
+            with dialect_of(engine).translated(name):
                 if create:
                     if address.is_sqlite:
                         make_file(address.path, name, file_access, belongs_to=belongs_to)
-                    birth = Birth(str(uuid.uuid4()), clock.wall_ns())
-                    log_id = await make_or_migrate(engine, name, birth=birth, belongs_to=belongs_to)
+                    log_id = await _make_or_migrate(engine, name, clock.wall_ns(), belongs_to=belongs_to)
                 else:
                     if address.is_sqlite:
                         must_exist(address.path, name)
-                    async with engine.connect() as connection:
-                        log_id = await recognise(connection, name)
+                    log_id = await _recognise(engine, name)
             return cls(address=address, engine=engine, log_id=log_id, writable=create)
         except BaseException:
             await engine.dispose()
             raise
 
-    @contextmanager
-    def translated(self) -> Iterator[None]:
+    def translated(self) -> AbstractContextManager[None]:
         """Translate driver errors raised inside to errors of this package; for code that uses `engine` directly."""
-        with _translated(self._dialect, str(self.address)):
-            yield
+        return self._dialect.translated(str(self.address))
 
     async def close(self) -> None:
         """Close every connection. Does nothing in a forked child, because the connections belong to the parent."""
@@ -350,16 +346,6 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-@contextmanager
-def _translated(dialect: Dialect, name: str) -> Iterator[None]:
-    try:
-        yield
-    except PycrormError:
-        raise
-    except dialect.faults as error:
-        raise dialect.translate_error(error, name) from error
-
-
 async def advance_folded(connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
     """Advance `folded` of each episode from the sequence before to the sequence now.
 
@@ -384,49 +370,49 @@ async def park(connection: AsyncConnection, number: int, reason: str | None) -> 
 _HOW_TO_CREATE = "record one with `pycrorm run` or `pycrorm demo`"
 
 
-async def recognise(connection: AsyncConnection, name: str, migrations: Migrations | None = None) -> str:
-    """Return the id of the log in this database. Raises `DatabaseUnavailable` without one, and `DatabaseForeign`."""
-    dialect = dialect_of(connection)
-    migrations = dialect.migrations if migrations is None else migrations
-    identity = await _find_log(dialect, connection, name, len(migrations))
+async def _recognise(engine: AsyncEngine, name: str) -> str:
+    async with engine.connect() as connection:
+        identity = await _find_log(connection, name)
     if identity is None:
         raise DatabaseUnavailable(f"{name} holds no memory yet: {_HOW_TO_CREATE}")
-    if identity.format < len(migrations):
+    if identity.format < len(dialect_of(engine).migrations):
         raise DatabaseUnavailable(f"{name} was made by an older version: `pycrorm writer --once` brings it up to date")
     return identity.log_id
 
 
-async def make_or_migrate(
-    engine: AsyncEngine,
-    name: str,
-    *,
-    birth: Birth,
-    migrations: Migrations | None = None,
-    belongs_to: str | None = None,
-) -> str:
+async def _make_or_migrate(engine: AsyncEngine, name: str, now_ns: int, *, belongs_to: str | None) -> str:
     """Create or migrate the log in this database if necessary; return its id.
 
     With `belongs_to`, the id of the log that should be here, raises `DatabaseUnavailable` instead of creating another.
     """
     dialect = dialect_of(engine)
-    migrations = dialect.migrations if migrations is None else migrations
     await dialect.prepare(engine, name)
     async with engine.begin() as connection:
         await dialect.lock_log_changes(connection)
-        identity = await _find_log(dialect, connection, name, len(migrations))
+        identity = await _find_log(connection, name)
         if identity is None and belongs_to is not None:
             raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
-        for statements in migrations[identity.format if identity else 0 :]:
+        for statements in dialect.migrations[identity.format if identity else 0 :]:
             await dialect.execute_all(connection, statements)
         if (await dialect.table_state(connection, schema.DIGEST)).creatable:
             await dialect.execute_all(connection, dialect.definition(schema.DIGEST, if_missing=True))
+        format_now = len(dialect.migrations)
         if identity is None:
-            values = {"id": birth.log_id, "format": len(migrations), "created_wall_ns": birth.created_wall_ns}
-            await dialect.execute(connection, schema.INSERT_LOG, one=1, **values)
-            return birth.log_id
-        if identity.format < len(migrations):
-            await dialect.execute(connection, schema.SET_FORMAT, to=len(migrations))
-        return identity.log_id
+            identity = LogIdentity(str(uuid.uuid4()), format_now)
+            values = {"one": 1, "id": identity.log_id, "format": format_now, "created_wall_ns": now_ns}
+            await dialect.execute(connection, schema.INSERT_LOG, **values)
+        elif identity.format < format_now:
+            await dialect.execute(connection, schema.SET_FORMAT, to=format_now)
+    return identity.log_id
+
+
+async def _find_log(connection: AsyncConnection, name: str) -> LogIdentity | None:
+    identity = await dialect_of(connection).find_log(connection, name)
+    readable = len(dialect_of(connection).migrations)
+    if identity is not None and identity.format > readable:
+        reason = f"its format is {identity.format}, this version reads {readable}"
+        raise DatabaseForeign(f"{name} was made by a newer version: {reason}")
+    return identity
 
 
 def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | None = None) -> None:
@@ -480,15 +466,6 @@ def _missing_log(log_id: str) -> str:
         f"holds no memory, and the spool belongs to log {log_id}: restore that log, choose another spool, or"
         " move the spool's records to a new log with `pycrorm spool rebind`"
     )
-
-
-async def _find_log(dialect: Dialect, connection: AsyncConnection, name: str, format_max: int) -> LogIdentity | None:
-    identity = await dialect.find_log(connection, name)
-    if identity is not None and identity.format > format_max:
-        raise DatabaseForeign(
-            f"{name} was made by a newer version: its format is {identity.format}, this version reads {format_max}"
-        )
-    return identity
 
 
 # === episode lookup ===========================================================================================

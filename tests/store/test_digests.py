@@ -138,13 +138,6 @@ async def test_an_append_that_was_rolled_back_leaves_the_running_digest(
     assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
 
 
-async def test_the_database_refuses_to_change_or_delete_a_digest(log: EventLog, database_url: str) -> None:
-    await log.append(whole(episode(1), 300))
-    for change in ("UPDATE pycrorm_digest SET digest = ''", "DELETE FROM pycrorm_digest"):
-        with pytest.raises(Exception, match="the event log is append-only: pycrorm_digest refuses"):
-            ask_to_change(database_url, change)
-
-
 async def test_an_episode_of_an_earlier_version_gets_no_digest_and_later_ones_do(
     log: EventLog, database_url: str
 ) -> None:

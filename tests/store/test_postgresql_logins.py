@@ -189,16 +189,6 @@ async def test_a_schema_of_another_program_is_left_alone(
     ]
 
 
-async def test_a_log_of_a_newer_version_is_refused(server: Server, caplog: pytest.LogCaptureFixture) -> None:
-    url = server.new_database()
-    await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
-    ask(url, "UPDATE pycrorm.pycrorm_log SET format = 99")
-    for create in (True, False):
-        error = await refused(url, caplog, create=create)
-        assert type(error) is DatabaseForeign
-        assert "its format is 99, this version reads 1" in str(error)
-
-
 async def test_a_server_without_free_connections_is_refused(server: Server, caplog: pytest.LogCaptureFixture) -> None:
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")
@@ -207,15 +197,6 @@ async def test_a_server_without_free_connections_is_refused(server: Server, capl
     error = await refused(server.url(database, user="guest"), caplog)
     assert type(error) is DatabaseUnavailable
     assert str(error).endswith(f'too many connections for database "{database}"')
-
-
-async def test_a_reader_without_a_memory_is_refused_and_makes_nothing(
-    server: Server, caplog: pytest.LogCaptureFixture
-) -> None:
-    url = server.new_database()
-    error = await refused(url, caplog, create=False)
-    assert str(error).endswith("holds no memory yet: record one with `pycrorm run` or `pycrorm demo`")
-    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname = 'pycrorm'") == [(0,)]
 
 
 # === tls ======================================================================================================
