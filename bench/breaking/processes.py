@@ -204,13 +204,23 @@ def _compare_recovered(outcome: Outcome, life: _Life) -> None:
     lines = life.recorder.wait_until_killed()
     acknowledged = {(line[1], int(line[2])) for line in lines if line[0] == "put"}
     by_position = {int(line[1]): (line[2], int(line[3]), line[4]) for line in lines if line[0] == "stored"}
+    ends: list[tuple[int, str, int]] = []
     for recorder in Spool(life.spool).recorders():
-        for each in asyncio.run(recover(recorder.path)):
-            if each.episode is not None and each.payload != LOST:
-                event = (episode_text(each.episode), each.sequence, each.payload.rstrip(b"x").decode())
-                outcome.corrupted += by_position.get(each.position, event) != event
-                by_position[each.position] = event
+        records = asyncio.run(recover(recorder.path))
+        outcome.corrupted += bool(records) and asyncio.run(recover(recorder.path)) != records
+        for each in records:
+            assert each.episode is not None, "it declares nothing"
+            if each.payload == LOST:
+                ends.append((each.position, episode_text(each.episode), each.sequence))
+                continue
+            event = (episode_text(each.episode), each.sequence, each.payload.rstrip(b"x").decode())
+            outcome.corrupted += by_position.get(each.position, event) != event
+            by_position[each.position] = event
     events = [by_position[position] for position in sorted(by_position)]
+    last = {name: sequence for name, sequence, _ in events}
+    outcome.misordered += [*sorted(by_position), *(at for at, *_ in ends)] != [*range(1, len(events) + len(ends) + 1)]
+    outcome.corrupted += len(ends) > life.threads
+    outcome.misordered += sum(sequence != last.get(name, 0) + 1 for _, name, sequence in ends)
     outcome.corrupted += sum(text != f"{name}/{sequence}/" for name, sequence, text in events)
     # Each thread may have been killed after it wrote an event and before it printed it.
     outcome.corrupted += max(0, len(events) - len(acknowledged) - life.threads)
@@ -403,14 +413,19 @@ async def _walk(url: str, spool: Path, writer: Writer, name: str, rng: random.Ra
                     elif chance < 0.55:
                         await memory.synced()
                         report("synced")
+            report("ended", place)
 
 
 class RecordedSteps:
-    """Collect the lines of killed plans: `certain` steps must exist, `possible` steps may exist."""
+    """Collect the lines of killed plans: `certain` steps must exist, `possible` steps may exist.
+
+    `ended` holds the places whose episodes ended before the plan was killed.
+    """
 
     def __init__(self) -> None:
         self.certain: list[Event] = []
         self.possible: list[Event] = []
+        self.ended: set[str] = set()
 
     def add(self, lines: list[list[str]], *, when_synced: bool = False) -> None:
         """Add the lines of one plan. With `when_synced` only the steps before the last `synced` are certain."""
@@ -418,6 +433,7 @@ class RecordedSteps:
         end = max([-1, *(index for index, line in enumerate(lines) if line[0] == "synced")])
         done = [(index, (place, step, "SUCCEEDED")) for index, place, step in returned]
         self.certain += [each for index, each in done if index < end or not when_synced]
+        self.ended |= {line[1] for line in lines if line[0] == "ended" and not when_synced}
         uncertain = [each for index, each in done if index > end and when_synced]
         # The plan died in the next step of the episode or in the first of the next one: LOST unless it had ended.
         last, sequence = (returned[-1][1], returned[-1][2]) if returned else ("", 0)
@@ -432,6 +448,9 @@ def compare_steps(outcome: Outcome, steps: RecordedSteps, url: str) -> None:
     rows = [(place, step, status) for place, step, status in ask(url, _STEPS)]
     outcome.compare(steps.certain, rows, put=steps.possible)
     outcome.corrupted += ask(url, _INCOMPLETE)[0][0]
+    episodes = ask(url, "SELECT description, status FROM process_metadata")
+    outcome.duplicated += len(episodes) - len(dict(episodes))
+    outcome.corrupted += sum(dict(episodes).get(place) != "SUCCEEDED" for place in steps.ended)
 
 
 def killed_plans(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:

@@ -3,7 +3,7 @@
 `python -m bench.faults` runs more and longer rounds, some on disks of their own.
 
  1  SIGKILL at any moment
-        test_killed (48 rounds, 10,000 in the soak), test_daemon, test_many_machines, store/test_crash
+        test_killed (24 kills, 10,000 in the soak), test_daemon, test_many_machines, store/test_crash
  2  killed at each step that touches disk or log, and once more
         test_crash_points; queue/test_dead_source (sealing, removing), queue/test_maintenance
  3  power cut: any sectors of what was not synced

@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from bench.breaking import processes
 from pycrorm_async.testing.postgresql_proxy import proxy_before
 from tests.commands import one_line_of, pycrorm
 from tests.crash.robot_processes import Lab
@@ -27,46 +28,23 @@ pytestmark = pytest.mark.slow
 # Kill daemons and plans with SIGKILL repeatedly: every step a plan performed is stored once and in its order.
 
 
-def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
-    for robot in [lab.start_robot() for _ in range(robots)]:
-        robot.wait_until_it_performs()
-    for _ in range(kills):
-        lab.start_daemon()
-        if lab.rng.random() < 0.5:
-            lab.kill_robot()
-            lab.start_robot()
-        # Python starts in about a second, so that most kills before that would hit a daemon that drains nothing.
-        time.sleep(0.7 + lab.rng.random() ** 2 * 1.5)
-        lab.kill_daemon()
-    begun = lab.log.read_text().count("draining")
-    lab.start_daemon()
-    while lab.log.read_text().count("draining") == begun:
-        time.sleep(0.05)
-    lab.kill_robot()
-    lab.stop_robots()
-    assert lab.stop_daemon() == 0
-    lab.verify_every_step_stored_once_in_order()
+def kill_daemons(server: Server | None, folder: Path, kills: int) -> None:
+    seed = random.SystemRandom().randrange(2**20)
+    print(f"seed {seed}")
+    outcome = processes.killed_daemons(server)(kills, random.Random(seed), folder, lambda: None)
+    assert outcome.clean, outcome
+    assert outcome.events > 100, "too little was done to prove anything"
 
 
-@pytest.mark.soak_on("postgresql")
-def test_killed_daemons_and_plans_leave_every_step_stored_once(database_url: str, tmp_path: Path) -> None:
-    lab = Lab(tmp_path, database_url, random.randrange(2**31), pause_s_max=0.1)
-    try:
-        kill_again_and_again(lab, robots=3, kills=2)
-    finally:
-        lab.clear()
+@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.soak)])
+def test_killed_daemons_and_plans_leave_every_step_stored_once(tmp_path: Path, kills: int, in_turn: bool) -> None:
+    kill_daemons(None, tmp_path, min(kills, 25) if in_turn else kills)
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("round_", range(5))
-def test_a_hundred_kills_of_daemons_and_plans_leave_every_step_stored_once(
-    database_url: str, tmp_path: Path, round_: int, in_turn: bool
-) -> None:
-    lab = Lab(tmp_path, database_url, random.randrange(2**31))
-    try:
-        kill_again_and_again(lab, robots=5, kills=5 if in_turn else 20)
-    finally:
-        lab.clear()
+def test_killed_daemons_plans_and_servers_leave_every_step_stored_once(tmp_path: Path, in_turn: bool) -> None:
+    with server_in_memory() as server:  # its own, because it is killed
+        kill_daemons(server, tmp_path, 25 if in_turn else 100)
 
 
 @pytest.fixture

@@ -83,18 +83,6 @@ def test_the_folder_of_a_recorder_that_is_alive_or_drained_is_not_opened(spool: 
     assert open_dead(spool / "gone") is None
 
 
-async def test_batches_keep_to_their_limits_including_computed_ends(author: FolderWriter) -> None:
-    for number in (1, 2, 3):
-        author.put(started(number), b"x" * 100)
-    recovered = open_dead(author.folder)
-    assert recovered is not None
-    positions = []
-    while batch := await recovered.get_batch(events_max=4, bytes_max=210, age_s_max=0.0):
-        positions.append([each.position for each in batch])
-    recovered.release()
-    assert positions == [[1, 2], [3, 4, 5, 6]]
-
-
 # --- torn ------------------------------------------------------------------------------------------------------
 
 
@@ -120,19 +108,6 @@ async def test_a_tail_torn_at_any_unsynced_byte_keeps_all_whole_records_before_i
 def torn_end(whole: bytes, offset: int, size: int, filling: bytes) -> int:
     """The end of a record here: after the last byte that differs from the zeros that fill the file."""
     return offset + len(whole[offset : offset + size].rstrip(filling))
-
-
-async def test_a_shortened_file_keeps_all_whole_records_before_the_cut(author: FolderWriter) -> None:
-    author.put(started())
-    author.sync()
-    safe_end = author.end
-    author.put(node(), b"unsynced")
-    path, whole = author.segments[0], author.segments[0].read_bytes()
-    for cut in range(safe_end, author.end):
-        path.write_bytes(whole[:cut])
-        assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)], cut
-    path.write_bytes(whole[: author.end])
-    assert await recover(author.folder) == [*author.records, lost(3, 1, 3)]
 
 
 async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_tail(author: FolderWriter) -> None:

@@ -21,10 +21,8 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.appender import Capacity
 from pycrorm_async.queue.format import EVENT, SEGMENT_BYTES_MAX, Frame, encode, read_segment, salt_of, segment_numbers
-from pycrorm_async.queue.locks import PROGRESS
 from pycrorm_async.queue.maintenance import inspect_recorder, inspect_spool, repair_folder
 from pycrorm_async.queue.scan import scan
-from pycrorm_async.queue.spool import Progress
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
@@ -188,18 +186,6 @@ async def test_segment_numbers_out_of_range_are_foreign_files(tmp_path: Path) ->
     assert [each for each in await recover(author.folder) if each.payload != LOST] == author.records
     with pytest.raises(FileNotFoundError):
         read_segment(author.folder / "gone")
-
-
-def test_an_unreadable_hint_is_ignored(tmp_path: Path) -> None:
-    progress = Progress.make(tmp_path)
-    progress.close()
-    whole = (tmp_path / PROGRESS).read_bytes()
-    for seed in range(20):
-        (tmp_path / PROGRESS).write_bytes(whole[:16] + random.Random(seed).randbytes(len(whole) - 16))
-        opened = Progress.open(tmp_path, writing=False)
-        assert opened is not None
-        assert (opened.recorded(), opened.drained().stored) == (opened.recorded().__class__(), 0)
-        opened.close()
 
 
 def test_a_database_note_that_is_no_text_is_reported_in_one_clear_line(tmp_path: Path) -> None:

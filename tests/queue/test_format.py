@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.queue.appender import Capacity, RepeatedDeclarations
 from pycrorm_async.queue.format import (
     COMMIT,
     DECLARATION,
@@ -137,12 +136,6 @@ def test_a_commit_has_its_golden_bytes_and_decodes_to_what_was_written() -> None
 
 
 @pytest.mark.parametrize("name", ["event", "declaration", "commit"])
-def test_a_frame_cut_at_any_byte_is_not_read(name: str) -> None:
-    for end in range(len(GOLDEN[name])):
-        assert decode(GOLDEN[name][:end], 0, SALT) is None, end
-
-
-@pytest.mark.parametrize("name", ["event", "declaration", "commit"])
 def test_a_frame_whose_last_bytes_are_still_zeros_is_not_read(name: str) -> None:
     whole = GOLDEN[name]
     for end in range(len(whole)):
@@ -213,15 +206,6 @@ def test_reading_stops_before_the_first_frame_that_is_cut_at_any_byte() -> None:
         assert list(decode_each(row[:end], 0, SALT)) == whole[:count], end
 
 
-def test_reading_stops_after_a_frame_with_any_one_bit_flipped() -> None:
-    row = b"".join(ROW)
-    whole = list(decode_each(row, 0, SALT))
-    for bit in range(88 * 8, 176 * 8):
-        changed = bytearray(row)
-        changed[bit // 8] ^= 1 << bit % 8
-        assert list(decode_each(bytes(changed), 0, SALT)) == whole[:1], bit
-
-
 def test_a_frame_is_decoded_only_when_it_is_requested() -> None:
     with mmap.mmap(-1, 4096) as buffer:
         buffer[:88] = GOLDEN["event"]
@@ -288,36 +272,6 @@ async def test_the_latest_descriptions_are_repeated_and_every_designator_type(tm
     assert EIGHTH - 600 < sum(64 + len(each) + 24 for each in described) <= EIGHTH
     records = await recover(writer.folder)
     assert [each.type for each in records[:3]] == ["EpisodeStarted", "DesignatorTypeDeclared", "DescriptionDeclared"]
-
-
-def test_a_description_larger_than_an_eighth_is_not_repeated_and_counted() -> None:
-    capacity = Capacity.of(SMALL)
-    declarations = RepeatedDeclarations(capacity.descriptions_bytes_max)
-    payload = description(1, EIGHTH)
-    declarations.add(payload, name=b"DescriptionDeclared", version=1, payload=payload, room=10 * EIGHTH)
-    assert (declarations.bytes, declarations.unrepeated) == (0, 1)
-    declarations.add(payload, name=b"DesignatorTypeDeclared", version=1, payload=payload, room=10 * EIGHTH)
-    assert (declarations.bytes, declarations.unrepeated) == (64 + len(payload), 1)
-
-
-def test_a_description_that_is_put_again_is_dropped_later() -> None:
-    size = 64 + len(b"DescriptionDeclared") + len(description(1))
-    declarations = RepeatedDeclarations(3 * size)
-    for number in (1, 2, 3, 1, 4):
-        body = b"DescriptionDeclared" + description(number)
-        declarations.add(body, name=b"DescriptionDeclared", version=1, payload=description(number), room=10 * size)
-    in_use = {each.payload for each in declarations._frames.values()}
-    assert in_use == {description(number) for number in (3, 1, 4)}
-
-
-def test_the_bytes_of_the_descriptions_are_counted_exactly() -> None:
-    declarations = RepeatedDeclarations(1_000)
-    for number in range(50):
-        payload = description(number % 7, 100 + 40 * (number % 3))
-        declarations.add(payload, name=b"DescriptionDeclared", version=1, payload=payload, room=5_000)
-        assert declarations.bytes == sum(64 + len(body) for body in declarations._frames)
-        assert 0 < declarations.bytes <= 1_000
-        assert payload in declarations._frames
 
 
 # === file format ==============================================================================================
@@ -473,12 +427,4 @@ def test_writes_into_touched_bytes_take_no_page_fault(tmp_path: Path) -> None:
     assert segment.buffer[:] == bytes(64 * mmap.PAGESIZE)
     assert page_faults_of_writes(segment, range(32)) < 8
     assert page_faults_of_writes(segment, range(32, 64)) >= 32
-    segment.close()
-
-
-def test_touching_beyond_the_end_of_a_segment_has_no_effect(tmp_path: Path) -> None:
-    segment = Segment.allocate(tmp_path, number=1, size=mmap.PAGESIZE)
-    for start, end in ((0, 2**30), (mmap.PAGESIZE - 1, 2**30), (mmap.PAGESIZE, 2**30), (0, 0)):
-        segment.touch(start, end)
-    assert segment.path.read_bytes() == bytes(mmap.PAGESIZE)
     segment.close()

@@ -107,18 +107,6 @@ async def test_no_producer_waits_for_space_in_a_closed_queue(filled: RecorderQue
         filled.put_nowait(node(), b"{}")
 
 
-async def test_a_full_queue_supplies_everything_and_then_accepts_records_again(filled: RecorderQueue) -> None:
-    fill(filled, reserved=True)
-    for _ in range(20):
-        await drain_all(filled)
-        async with asyncio.timeout(10):
-            await filled.room()
-        filled.put_nowait(node(), PAYLOAD)
-    filled.close()
-    assert [each.position for each in await drain(filled)] == [filled.written]
-    assert filled.written == 1 + ALL + 20
-
-
 async def test_a_producer_that_waits_for_a_queue_that_is_not_drained_learns_why(filled: RecorderQueue) -> None:
     fill(filled, reserved=True)
     waiting = asyncio.ensure_future(filled.room())
@@ -233,27 +221,6 @@ async def test_a_wait_for_a_full_disk_ends_soon_after_the_disk_has_space(
 # Admission to the queue: files never exceed the limit, and the reserve is kept for reserved records.
 
 FIVE_SEGMENTS = Capacity(segment_bytes=1000, segments_max=5, reserve_bytes=500, episodes_max=10)
-
-
-def test_an_empty_segment_holds_all_but_its_header_and_two_commits() -> None:
-    assert FIVE_SEGMENTS.end == 1000 - 2 * 72
-    assert FIVE_SEGMENTS.frame_bytes_max(episodes=0) == 1000 - 2 * 72 - 56
-    assert FIVE_SEGMENTS.frame_bytes_max(episodes=3) == 1000 - 2 * 72 - 56 - 3 * 40
-
-
-def test_ordinary_records_leave_the_reserve_free_in_the_last_segment() -> None:
-    assert FIVE_SEGMENTS.ordinary_end(spare=4, episodes=0) == 856
-    assert FIVE_SEGMENTS.ordinary_end(spare=0, episodes=0) == 856 - 500
-    assert FIVE_SEGMENTS.admits(100, offset=256, spare=0, episodes=0, reserved=False)
-    assert not FIVE_SEGMENTS.admits(101, offset=256, spare=0, episodes=0, reserved=False)
-    assert FIVE_SEGMENTS.admits(600, offset=256, spare=0, episodes=0, reserved=True)
-    assert not FIVE_SEGMENTS.admits(601, offset=256, spare=0, episodes=0, reserved=True)
-
-
-def test_a_frame_that_does_not_fit_needs_a_segment_of_its_own() -> None:
-    assert FIVE_SEGMENTS.admits(700, offset=800, spare=1, episodes=0, reserved=True)
-    assert not FIVE_SEGMENTS.admits(700, offset=800, spare=0, episodes=0, reserved=True)
-    assert not FIVE_SEGMENTS.admits(801, offset=800, spare=1, episodes=0, reserved=True)
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ from pycrorm_async.queue.locks import ALIVE, FileLock
 from pycrorm_async.queue.spool import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
     ALL,
-    DECLARED,
     ORDINARY,
     PAYLOAD,
     SMALL,
@@ -53,32 +52,6 @@ def segments(queue: RecorderQueue) -> list[str]:
 # --- supplied records -------------------------------------------------------------------------------------------------
 
 
-async def test_synced_records_are_supplied_whole_and_in_order_over_many_segments(spool: Path) -> None:
-    queue = make(spool, offered=True)
-    source = take(queue)
-    queue.put_nowait(DECLARED, b"{}")
-    queue.put_nowait(started(), b"{}")
-    for number in range(30):
-        queue.put_nowait(node(), b"%d" % number + b"x" * 200)
-    queue.put_nowait(ended(), b"{}")
-    await queue.synced_to()
-    records: list[Record] = []
-    while not records or records[-1].type != "EpisodeEnded":
-        records += await source.get_batch(events_max=7, bytes_max=2**22, age_s_max=0.05)
-    assert [each.position for each in records] == list(range(1, queue.written + 1))
-    declarations = [each for each in records if each.episode is None]  # repeated at the beginning of a segment
-    assert declarations == [record(each.position, DECLARED, 0, b"{}") for each in declarations]
-    assert (declarations[0].position, len(declarations)) == (1, queue.written - 32)
-    assert [each._replace(position=0) for each in records if each.episode is not None] == [
-        record(0, started(), 1, b"{}"),
-        *(record(0, node(), 2 + number, b"%d" % number + b"x" * 200) for number in range(30)),
-        record(0, ended(), 32, b"{}"),
-    ]
-    assert len(segments(queue)) > 2
-    source.release()
-    queue.release()
-
-
 async def test_records_that_are_not_synced_are_not_supplied(spool: Path) -> None:
     queue = make(spool, settings=replace(SMALL, sync_interval_ms=3_600_000), offered=True)
     source = take(queue)
@@ -90,36 +63,6 @@ async def test_records_that_are_not_synced_are_not_supplied(spool: Path) -> None
     assert await waiting == [1]
     source.release()
     queue.release()
-
-
-async def test_limits_of_a_batch_hold_and_a_larger_record_comes_alone(offered: RecorderQueue) -> None:
-    source = take(offered)
-    offered.put_nowait(started(), b"x" * 10)
-    for size in (10, 10, 1000, 10):
-        offered.put_nowait(node(), b"x" * size)
-    await offered.synced_to()
-    assert await next_positions(source, events_max=2) == [1, 2]
-    assert await next_positions(source, bytes_max=500) == [3]
-    assert await next_positions(source, bytes_max=500) == [4]
-    assert await next_positions(source, bytes_max=500) == [5]
-    source.release()
-
-
-async def test_after_finish_only_records_that_were_synced_before_are_supplied(offered: RecorderQueue) -> None:
-    source = take(offered)
-    offered.put_nowait(started(), b"{}")
-    await offered.synced_to()
-    await eventually(lambda: source._progress.recorded().synced == 1)
-    source.finish()
-    offered.put_nowait(node(), b"{}")
-    await offered.synced_to()
-    assert await next_positions(source) == [1]
-    assert await next_positions(source) == []
-    assert await next_positions(source) == []
-    source.release()
-    again = take(offered)
-    assert await next_positions(again) == [1, 2]
-    again.release()
 
 
 # --- permission to drain ----------------------------------------------------------------------------------------------
@@ -163,29 +106,6 @@ async def test_a_deleted_folder_is_neither_taken_nor_made_again(spool: Path) -> 
 
 
 # --- stored records ---------------------------------------------------------------------------------------------------
-
-
-async def test_segments_are_deleted_when_they_are_stored_and_not_before(offered: RecorderQueue) -> None:
-    source = take(offered)
-    offered.put_nowait(started(), b"{}")
-    fill(offered)
-    await offered.synced_to()
-    before = segments(offered)
-    assert await next_positions(source) == list(range(1, 2 + ORDINARY))
-    await asyncio.sleep(0.2)
-    assert segments(offered)[: len(before)] == before
-    assert len(segments(offered)) <= len(before) + 1  # the next segment may already be prepared
-    assert offered.stored == 0
-    await source.acknowledge(4)  # the first segment holds four records
-    await eventually(lambda: segments(offered)[0] == "00000002.segment")
-    assert offered.stored == 4
-    await source.acknowledge(1 + ORDINARY)
-    await eventually(lambda: len(segments(offered)) <= 2)
-    assert offered.stored == 1 + ORDINARY
-    # Draining continues where the deleted segments ended.
-    offered.put_nowait(ended(), b"{}")
-    assert await next_positions(source) == [2 + ORDINARY]
-    source.release()
 
 
 async def test_another_drainer_continues_after_the_visible_records(offered: RecorderQueue) -> None:
@@ -301,24 +221,6 @@ async def test_impossible_progress_is_ignored(offered: RecorderQueue) -> None:
         await next_positions(source)
     source.release()
     lying.close()
-
-
-async def test_visibility_and_stops_are_noticed_at_once(offered: RecorderQueue) -> None:
-    offered.put_nowait(started(), b"{}")
-    await offered.synced_to()
-    source = take(offered)
-    assert await next_positions(source) == [1]
-    source.mark_unavailable("locked")
-    source.mark_visible(1, {"an episode": "parked"})
-    status = offered.external_drain_status
-    assert status is not None
-    assert (status.stored, status.folded) == (0, 1)
-    assert (status.note.unavailable, status.note.stopped) == ("locked", {"an episode": "parked"})
-    source.mark_unavailable(None)
-    status = offered.external_drain_status
-    assert status is not None
-    assert status.note.unavailable is None
-    source.release()
 
 
 # === live source end ==========================================================================================

@@ -184,27 +184,6 @@ async def test_a_type_name_too_long_for_a_frame_is_refused(queue: RecorderQueue)
     assert queue.put_nowait(Heading(started().episode, "ä" * 127, 1), b"{}") == 2
 
 
-async def test_a_batch_is_complete_at_the_limit_of_events(queue: RecorderQueue) -> None:
-    queue.put_nowait(started(), b"{}")
-    for _ in range(5):
-        queue.put_nowait(node(), b"{}")
-    await queue.synced_to()
-    assert [each.position for each in await batch_of(queue, 4, age_s=LONG_S)] == [1, 2, 3, 4]
-    assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [5, 6]
-
-
-async def test_a_batch_is_complete_at_its_bytes_and_a_larger_record_comes_alone(queue: RecorderQueue) -> None:
-    for payload in (started(), node(), node(), node(), node()):
-        queue.put_nowait(payload, b"x" * 100)
-    queue.put_nowait(node(), b"x" * 1000)
-    queue.put_nowait(node(), b"x")
-    await queue.synced_to()
-    batches = [await batch_of(queue, 99, bytes_max=250, age_s=0.01) for _ in range(4)]
-    sizes = [[len(each.payload) for each in batch] for batch in batches]
-    assert sizes == [[100, 100], [100, 100], [100], [1000]]
-    assert [len(each.payload) for each in await batch_of(queue, 99, bytes_max=250)] == [1]
-
-
 async def test_a_batch_is_complete_at_its_age_with_the_records_that_came_until_then(
     queue: RecorderQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,27 +238,6 @@ async def test_a_consumer_in_its_own_loop_and_thread_is_woken_by_producers(queue
     queue.close()
     assert await consumed == list(range(1, 22))
     assert queue.stored == 21
-
-
-async def test_segments_roll_over_and_are_deleted_once_all_their_records_are_acknowledged(queue: RecorderQueue) -> None:
-    def files() -> list[str]:
-        return sorted(path.name for path in queue.folder.glob("*.segment"))
-
-    queue.put_nowait(started(), b"{}")
-    for _ in range(8):
-        queue.put_nowait(node(), b"x" * 900)
-    # The first segment holds one record of 80 bytes and three of 976, the next three, the third the last two.
-    await queue.synced_to()
-    records = await batch_of(queue, 9)
-    assert [each.position for each in records] == list(range(1, 10))
-    await queue.acknowledge(3)
-    await settle(queue)
-    assert files()[:3] == ["00000001.segment", "00000002.segment", "00000003.segment"]
-    await queue.acknowledge(4)
-    await until(lambda: files()[0] == "00000002.segment")
-    await queue.acknowledge(9)
-    await until(lambda: files()[0] == "00000003.segment")
-    assert (queue.stored, queue.synced, queue.written) == (9, 11, 11)  # the last two were put by settle
 
 
 async def test_bytes_spooled_counts_headers_records_and_commits(tmp_path: Path) -> None:
@@ -437,16 +395,6 @@ async def test_a_second_recorder_with_the_same_id_is_refused(queue: RecorderQueu
     with pytest.raises(SpoolUnavailable):
         make(spool)
     assert queue.put_nowait(started(), b"{}") == 1
-
-
-@pytest.mark.parametrize("deep", [False, True])
-def test_a_spool_that_cannot_be_made_is_reported_in_one_clear_line(tmp_path: Path, deep: bool) -> None:
-    blocking = tmp_path / "blocking"
-    blocking.touch()
-    with pytest.raises(SpoolUnavailable) as refused:
-        make(blocking / "spool" if deep else blocking)
-    assert str(blocking) in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 # --- fdatasync --------------------------------------------------------------------------------------------------------
