@@ -41,6 +41,7 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import (
     DeclarativeBase,
     InstanceState,
+    InstrumentedAttribute,
     MappedAsDataclass,
     MappedColumn,
     Mapper,
@@ -274,7 +275,7 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
     def __repr__(self) -> str:
         mapper = inspect(self).mapper
         names = [
-            *(each.key for each in mapper.column_attrs if not each.key.startswith("_")),
+            *(each.key for each in mapper.column_attrs if not each.key.startswith("_") and not _is_deferred(each)),
             *(["robot_state"] if "robot_state" in mapper.relationships else []),
         ]
         shown = ", ".join(f"{name}={value!r}" for name in names if (value := self._readable(name)) is not None)
@@ -308,12 +309,19 @@ class RowOfEvent:
 
 
 @event.listens_for(Base, "mapper_configured", propagate=True)
-def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:  # noqa: ARG001  SQLAlchemy's
-    """Let columns of subclasses be loaded in batches, and note the enum columns for `_read_members`."""
+def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:
+    """Let columns of subclasses be loaded in batches, guard attributes on request, and note the enum columns."""
     if mapper.inherits is not None:
         mapper.class_manager.expired_attribute_loader = load_columns
+    for each in (*mapper.column_attrs, *mapper.relationships):
+        if not each.key.startswith("_") and (_is_deferred(each) or each.info.get("on_request")):
+            getattr(class_, each.key).__class__ = AttributeOnRequest
     kinds = {each.key: each.columns[0].type for each in mapper.column_attrs}
     mapper.class_manager.info[_ENUMS] = {key: kind for key, kind in kinds.items() if isinstance(kind, EnumName)}
+
+
+def _is_deferred(attribute: Any) -> bool:
+    return getattr(attribute, "deferred", False) is True
 
 
 def require_loaded(row: Base, name: str, requested_by: Base | None = None, request: str | None = None) -> None:
@@ -328,19 +336,28 @@ def require_loaded(row: Base, name: str, requested_by: Base | None = None, reque
         return
     named, attribute = requested_by or row, request or name.removeprefix("_")
     state, class_ = inspect(named), type(named).__name__
-    key, option = state.identity, "undefer" if f"_{attribute}" in state.mapper.column_attrs else "selectinload"
+    columns = state.mapper.column_attrs
+    key, option = state.identity, "undefer" if {attribute, f"_{attribute}"} & {*columns.keys()} else "selectinload"
     raise CallerError(
         f"{attribute} of {class_} {key} is not loaded: in its session use `await row.awaitable_attrs.{attribute}`,"
         f" or select with `{option}({class_}.{attribute})`"
     )
 
 
-def on_request(name: str) -> property:
-    """Return the descriptor of a synonym whose relationship or deferred column, `_name`, is loaded on request only.
+ON_REQUEST: Final = {"on_request": True}
+"""Marks a relationship that is loaded on request only, as deferred columns are."""
 
-    Reading it raises `CallerError` if it is not loaded.
-    """
-    return property(_reader(name))
+
+class AttributeOnRequest(InstrumentedAttribute[Any]):
+    """An attribute of a mapped class that raises `CallerError` if it is read without being loaded."""
+
+    inherit_cache = True
+    __slots__ = ()
+
+    def __get__(self, instance: Any, owner: Any) -> Any:
+        if instance is not None:
+            require_loaded(instance, self.key)
+        return super().__get__(instance, owner)
 
 
 def _reader(name: str) -> Callable[[Any], Any]:
@@ -352,10 +369,7 @@ def _reader(name: str) -> Callable[[Any], Any]:
 
 
 class HybridOnRequest(hybrid_property[_Value]):
-    """A descriptor like that of `on_request`, for a class with joined inheritance, whose subclasses a query may select.
-
-    A synonym in a query of a subclass would be that of the base, without a join to it.
-    """
+    """A descriptor like `AttributeOnRequest`, for a class whose subclasses may have a field of this name."""
 
     def __init__(self, read: Callable[[Any], _Value]) -> None:
         name = read.__name__

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import COMPUTED, Base, JsonText, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.base import COMPUTED, ON_REQUEST, Base, JsonText, RowOfEvent, one_of
 from pycrorm_async.world.pose import ObjectType
 
 __all__ = [
@@ -84,8 +84,7 @@ class ProcessMetaData(Base):
     """The metadata of the executive; the column is `metadata`, a name that SQLAlchemy reserves as an attribute."""
     tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, order_by="EpisodeTag.tag")
     tags = property(lambda self: [each.tag for each in self.tag_rows], doc="The tags, in alphabetical order.")
-    _robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, order_by="EpisodeRobot.id")
-    robots: Mapped[list[EpisodeRobot]] = synonym("_robots", descriptor=on_request("robots"))
+    robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, order_by="EpisodeRobot.id", info=ON_REQUEST)
     """The robots that took part, in the order in which they were added. Loaded on request."""
 
     pycram_version: Mapped[str] = synonym("version")

@@ -48,6 +48,7 @@ from pycrorm_async.events.types import BoxValue, DescriptionDeclared, MeshValue
 from pycrorm_async.orm.base import (
     COMPUTED,
     EPISODE,
+    ON_REQUEST,
     Base,
     HybridOnRequest,
     JsonText,
@@ -56,7 +57,6 @@ from pycrorm_async.orm.base import (
     is_built_in,
     known_classes,
     many_of,
-    on_request,
     one_of,
     require_loaded,
 )
@@ -227,7 +227,7 @@ class Object(RowOfEvent, Base):
     base_link: Mapped[str | None]
 
     pose: Mapped[Pose | None] = one_of(lambda: Object.pose_id, "pose")
-    _description: Mapped[ObjectDescription | None] = relationship(
+    description: Mapped[ObjectDescription | None] = relationship(
         secondary=lambda: _ADDED,
         primaryjoin=lambda: and_(
             Object.identity_id == _ADDED.c.id, Object.process_metadata_id == _ADDED.c.process_metadata_id
@@ -235,8 +235,9 @@ class Object(RowOfEvent, Base):
         secondaryjoin=lambda: _ADDED.c.description_fingerprint == ObjectDescription.fingerprint,
         viewonly=True,
         uselist=False,
+        info=ON_REQUEST,
     )
-    _node: Mapped[TaskTreeNode | None] = one_of(lambda: Object.node_id, "task_tree_node")
+    node: Mapped[TaskTreeNode | None] = one_of(lambda: Object.node_id, "task_tree_node", info=ON_REQUEST)
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
@@ -249,9 +250,6 @@ class Object(RowOfEvent, Base):
         """
         types = select(ObjectConcept.obj_type).where(is_concept(ObjectConcept.__table__.c.concept, concept))
         return cls.obj_type.in_(types)
-
-    node: Mapped[TaskTreeNode | None] = synonym("_node", descriptor=on_request("node"))
-    description: Mapped[ObjectDescription | None] = synonym("_description", descriptor=on_request("description"))
 
 
 _ADDED: FromClause = Object.__table__.alias("added")
@@ -720,17 +718,14 @@ class TaskTreeNode(RowOfEvent, Base):
     simulated: Mapped[bool]
     duration_s: Mapped[float | None] = mapped_column(info=COMPUTED)
     duration: Mapped[float | None] = mapped_column(info=COMPUTED)
-    _outcome: Mapped[str | None] = mapped_column("outcome", deferred=True, info=COMPUTED)
+    outcome: Mapped[str | None] = mapped_column(deferred=True, info=COMPUTED)
 
-    outcome: Mapped[str | None] = synonym("_outcome", descriptor=on_request("outcome"))
     action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")
     parent: Mapped[TaskTreeNode | None] = one_of(lambda: TaskTreeNode.parent_id, "task_tree_node")
-    _children: Mapped[list[TaskTreeNode]] = many_of(
-        lambda: TaskTreeNode.parent_id, "task_tree_node", order_by=lambda: TaskTreeNode.id
+    children: Mapped[list[TaskTreeNode]] = many_of(
+        lambda: TaskTreeNode.parent_id, "task_tree_node", order_by=lambda: TaskTreeNode.id, info=ON_REQUEST
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
-
-    children: Mapped[list[TaskTreeNode]] = synonym("_children", descriptor=on_request("children"))
 
     @property
     def ancestors(self) -> list[TaskTreeNode]:
@@ -838,14 +833,13 @@ class LocationResolution(RowOfEvent, Base):
     candidates: Mapped[list[LocationCandidate]] = many_of(
         lambda: LocationCandidate.resolution_id, "location_resolution", order_by=LocationCandidate.position
     )
-    _refusals: Mapped[list[LocationRefusal]] = many_of(
+    refusals: Mapped[list[LocationRefusal]] = many_of(
         lambda: LocationRefusal.resolution_id,
         "location_resolution",
         order_by=LocationRefusal.position,
+        info=ON_REQUEST,
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
-
-    refusals: Mapped[list[LocationRefusal]] = synonym("_refusals", descriptor=on_request("refusals"))
 
 
 # === perception ===============================================================================================

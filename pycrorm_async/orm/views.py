@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 
 from sqlalchemy import ForeignKey
-from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
+from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.base import ON_REQUEST, Base, RowOfEvent, one_of
 from pycrorm_async.orm.episodes import ProcessMetaData
 from pycrorm_async.orm.rows import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
@@ -67,39 +67,23 @@ class PickUpWithContextView(RowOfEvent, Base):
     node_id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"))
     object_x: Mapped[float]
     object_y: Mapped[float]
-    _object_z: Mapped[float] = mapped_column("object_z", deferred=True)
-    _object_qx: Mapped[float] = mapped_column("object_qx", deferred=True)
-    _object_qy: Mapped[float] = mapped_column("object_qy", deferred=True)
-    _object_qz: Mapped[float] = mapped_column("object_qz", deferred=True)
-    _object_qw: Mapped[float] = mapped_column("object_qw", deferred=True)
+    object_z: Mapped[float] = mapped_column(deferred=True)
+    object_qx: Mapped[float] = mapped_column(deferred=True)
+    object_qy: Mapped[float] = mapped_column(deferred=True)
+    object_qz: Mapped[float] = mapped_column(deferred=True)
+    object_qw: Mapped[float] = mapped_column(deferred=True)
     robot_in_object_x: Mapped[float]
     robot_in_object_y: Mapped[float]
-    _robot_in_object_z: Mapped[float] = mapped_column("robot_in_object_z", deferred=True)
-    _robot_in_object_qx: Mapped[float] = mapped_column("robot_in_object_qx", deferred=True)
-    _robot_in_object_qy: Mapped[float] = mapped_column("robot_in_object_qy", deferred=True)
-    _robot_in_object_qz: Mapped[float] = mapped_column("robot_in_object_qz", deferred=True)
-    _robot_in_object_qw: Mapped[float] = mapped_column("robot_in_object_qw", deferred=True)
-    _height_over_torso: Mapped[float | None] = mapped_column("height_over_torso", deferred=True)
-    _robot: Mapped[str | None] = mapped_column("robot", deferred=True)
-    _description: Mapped[str] = mapped_column("description", deferred=True)
-    _scene: Mapped[str | None] = mapped_column("scene", deferred=True)
-    _policy: Mapped[str | None] = mapped_column("policy", deferred=True)
-
-    object_z: Mapped[float] = synonym("_object_z", descriptor=on_request("object_z"))
-    object_qx: Mapped[float] = synonym("_object_qx", descriptor=on_request("object_qx"))
-    object_qy: Mapped[float] = synonym("_object_qy", descriptor=on_request("object_qy"))
-    object_qz: Mapped[float] = synonym("_object_qz", descriptor=on_request("object_qz"))
-    object_qw: Mapped[float] = synonym("_object_qw", descriptor=on_request("object_qw"))
-    robot_in_object_z: Mapped[float] = synonym("_robot_in_object_z", descriptor=on_request("robot_in_object_z"))
-    robot_in_object_qx: Mapped[float] = synonym("_robot_in_object_qx", descriptor=on_request("robot_in_object_qx"))
-    robot_in_object_qy: Mapped[float] = synonym("_robot_in_object_qy", descriptor=on_request("robot_in_object_qy"))
-    robot_in_object_qz: Mapped[float] = synonym("_robot_in_object_qz", descriptor=on_request("robot_in_object_qz"))
-    robot_in_object_qw: Mapped[float] = synonym("_robot_in_object_qw", descriptor=on_request("robot_in_object_qw"))
-    height_over_torso: Mapped[float | None] = synonym("_height_over_torso", descriptor=on_request("height_over_torso"))
-    robot: Mapped[str | None] = synonym("_robot", descriptor=on_request("robot"))
-    description: Mapped[str] = synonym("_description", descriptor=on_request("description"))
-    scene: Mapped[str | None] = synonym("_scene", descriptor=on_request("scene"))
-    policy: Mapped[str | None] = synonym("_policy", descriptor=on_request("policy"))
+    robot_in_object_z: Mapped[float] = mapped_column(deferred=True)
+    robot_in_object_qx: Mapped[float] = mapped_column(deferred=True)
+    robot_in_object_qy: Mapped[float] = mapped_column(deferred=True)
+    robot_in_object_qz: Mapped[float] = mapped_column(deferred=True)
+    robot_in_object_qw: Mapped[float] = mapped_column(deferred=True)
+    height_over_torso: Mapped[float | None] = mapped_column(deferred=True)
+    robot: Mapped[str | None] = mapped_column(deferred=True)
+    description: Mapped[str] = mapped_column(deferred=True)
+    scene: Mapped[str | None] = mapped_column(deferred=True)
+    policy: Mapped[str | None] = mapped_column(deferred=True)
 
 
 class RootFailure(RowOfEvent, Base):
@@ -175,6 +159,5 @@ class SpatialRelation(RowOfEvent, Base):
     other: Mapped[str]
     link: Mapped[str] = mapped_column(primary_key=True)
 
-    _node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node")
-    node: Mapped[TaskTreeNode] = synonym("_node", descriptor=on_request("node"))
+    node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node", info=ON_REQUEST)
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)

@@ -29,7 +29,6 @@ from sqlalchemy import (
     Text,
 )
 from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
@@ -242,15 +241,6 @@ class Layout(msgspec.Struct, frozen=True):
             if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in {*types, *self.renamed}:
                 types[leaf.dtype] = DesignatorType(leaf.kind, (leaf.table,))
         return msgspec.structs.replace(self, leaves=tables, types=types)
-
-    def with_unmade(self, declaration: str, reason: str) -> Self:
-        """Return the layout with the reason why the declaration of this fingerprint has no tables."""
-        return msgspec.structs.replace(self, unmade=self.unmade | {declaration: reason})
-
-    def with_unreadable(self, declarations: Iterable[str]) -> Self:
-        """Return the layout with the fingerprints of declarations that are not JSON a database can read."""
-        every = dict.fromkeys((*self.unreadable, *declarations))
-        return msgspec.structs.replace(self, unreadable=tuple(every))
 
     def with_views(self, views: Mapping[str, str], kept: Mapping[str, MaterialisedView]) -> Self:
         """Return the layout with these users' views, which replace those of the same names."""
@@ -489,13 +479,12 @@ def _make_table(
     if keys := [table.c[column] for column, storage in columns.items() if storage == "key"]:
         table.append_constraint(_Key(*keys))
     for column in indexed(name, columns):
-        Index(
-            index_name(name, column, generation),
-            _IndexKeys(
-                *(table.c[each] for each in (column, *_FURTHER.get((name, column), ()))),
-                on_postgresql=[table.c[each] for each in _FURTHER_ON_POSTGRESQL.get((name, column), ())],
-            ),
-        )
+        keys = [table.c[each] for each in (column, *_FURTHER.get((name, column), ()))]
+        if further := [table.c[each] for each in _FURTHER_ON_POSTGRESQL.get((name, column), ())]:
+            Index(index_name(name, column, generation), *keys, info={"dialect": "sqlite"})
+            Index(index_name(name, column, generation), *keys, *further, info={"dialect": "postgresql"})
+        else:
+            Index(index_name(name, column, generation), *keys)
     if name == "task_tree_node":
         dtype, key_columns, included = _PICK_UPS
         Index(
@@ -511,22 +500,6 @@ def _make_table(
 def columns_in_order(table: Table) -> list[Column[Any]]:
     """Return the columns in the order of the layout, which is that of the views; the table has the widest first."""
     return [table.c[each] for each in table.info[_ORDER]]
-
-
-class _IndexKeys(FunctionElement[int]):
-    """The key columns of an index."""
-
-    inherit_cache = False
-
-    def __init__(self, *columns: Column[Any], on_postgresql: Sequence[Column[Any]]) -> None:
-        super().__init__(*columns, *on_postgresql)
-        self.count = len(columns)
-
-
-@compiles(_IndexKeys)
-def _by_dialect(element: _IndexKeys, compiler: Any, **options: Any) -> str:
-    columns = list(element.clauses)[: None if compiler.dialect.name == "postgresql" else element.count]
-    return ", ".join(compiler.process(each, **options) for each in columns)
 
 
 class _Key(PrimaryKeyConstraint):
@@ -636,8 +609,10 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             refused[name] = str(reason)
         except (UnknownShape, msgspec.DecodeError) as error:  # from a newer version, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"
-    unreadable = [fingerprint(each) for each in payloads if not _is_readable(each)]
-    return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused, adjustments)
+    if unreadable := [fingerprint(each) for each in payloads if not _is_readable(each)]:
+        unreadable = [*dict.fromkeys((*layout.unreadable, *unreadable))]
+        layout = msgspec.structs.replace(layout, unreadable=tuple(unreadable))
+    return Union(layout, accepted, refused, adjustments)
 
 
 def _fit(

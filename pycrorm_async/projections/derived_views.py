@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any, Final, NamedTuple, Self, TypeVar
+from typing import Any, Final, Protocol, Self, TypeVar
 
 from sqlalchemy import (
     Boolean,
@@ -51,7 +51,7 @@ from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
-from pycrorm_async.projections.columns import EPISODE
+from pycrorm_async.projections.columns import EPISODE, LINK_BOX
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.model_boxes import link_boxes
 from pycrorm_async.world.models import built_in_model, built_in_urdf
@@ -79,18 +79,17 @@ def _planner_hint(fact: ColumnElement[bool]) -> ColumnElement[bool]:
     return PerDatabase(literal_column("1", Boolean()), postgresql=fact)
 
 
-def pick_ups_with_context(
-    picked: FromClause,
-    node: Table,
-    object_: Table,
-    removal: Table,
-    pose: Table,
-    episode: Table,
-    dtypes: Sequence[str],
-) -> Select[*tuple[Any, ...]]:
+class TablesByName(Protocol):
+    """Protocol of the tables behind the views (`views.Tables`)."""
+
+    def __getitem__(self, name: str) -> Table: ...
+
+
+def pick_ups_with_context(tables: TablesByName, picked: FromClause, dtypes: Sequence[str]) -> Select[*tuple[Any, ...]]:
     """Return the view's query. A node, its designator and its leaf row have the same id, so they join without a key
     column. `dtypes` are all dtypes that a node with a row in `picked` may have."""
-    robot, place = pose.alias("robot"), pose.alias("there")
+    node, object_, episode = tables["task_tree_node"], tables["object"], tables["process_metadata"]
+    robot, place = tables["pose"].alias("robot"), tables["pose"].alias("there")
     stands, lies = numbers(robot, _POSE), numbers(place, _POSE)
 
     def of_episode(value: ColumnElement[Any]) -> ScalarSelect[Any]:
@@ -98,7 +97,7 @@ def pick_ups_with_context(
         return select(value).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
 
     seen = dict(zip(_POSE.split(), _seen_from(lies, stands), strict=True))
-    in_world = world_line(object_, removal, episode.c.id)  # of an episode that has not ended, or was LOST
+    in_world = world_line(tables, episode.c.id)  # of an episode that has not ended, or was LOST
     world = func.coalesce(episode.c.world, episode.c.entered_world, in_world)
 
     return (
@@ -287,11 +286,12 @@ OBJECTS_MAX = 1_000
 """Bounds the objects in the line, because an episode may add any number."""
 
 
-def world_line(objects: Table, removals: Table, episode: ColumnElement[int]) -> ColumnElement[str]:
+def world_line(tables: TablesByName, episode: ColumnElement[int]) -> ColumnElement[str]:
     """Return name and type of the objects in the world of the episode, such as `pr2 (ROBOT), milk (MILK)`.
 
     If the world was left, of those that were in it; null if there were none.
     """
+    objects, removals = tables["object"], tables["object_removal"]
     removed = exists().where(
         removals.c.identity_id == objects.c.id, removals.c.process_metadata_id == objects.c.process_metadata_id
     )
@@ -420,8 +420,9 @@ _FIELDS_POSTGRESQL = """json_each(CAST(up.parameters AS json)) AS field WHERE
  OR (field.value ->> 'dtype' IS NOT NULL AND field.value ->> 'name' IS NOT NULL))"""
 
 
-def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
+def root_failures(tables: TablesByName) -> Select[*tuple[Any, ...]]:
     """Return the view's query."""
+    nodes, objects = tables["task_tree_node"], tables["object"]
     child = nodes.alias("child")
     failed_child = exists(
         select(literal_column("1")).where(
@@ -574,22 +575,10 @@ _NUMBERS = [f"{letter}{axis}" for letter in "cha" for axis in _AXES]
 """A box: its center, half of its edges, and the direction in which its joint slides it."""
 
 
-class SpatialTables(NamedTuple):
-    """The tables that the view reads."""
-
-    node: Table
-    object: Table
-    removal: Table
-    pose: Table
-    joint_change: Table
-
-
-def spatial_relations(
-    tables: SpatialTables, link_box: Table, picked: FromClause, placed: FromClause, *, simulated: bool
-) -> Select[Any]:
+def spatial_relations(tables: TablesByName, picked: FromClause, placed: FromClause, *, simulated: bool) -> Select[Any]:
     """Return the view's query; `picked` and `placed` are the rows of pick-ups and placings."""
     moments = _moments(tables, picked, placed, simulated=simulated)
-    boxes = _boxes(link_box)
+    boxes = _boxes(tables[LINK_BOX])
     # The second select continues the first. PostgreSQL would compute two that are joined by their nodes once a node.
     one = _placed_boxes(tables, moments, _around(boxes), same=True)
     both = _placed_boxes(tables, one, boxes, same=False).c
@@ -621,9 +610,9 @@ def spatial_relations(
     return select(*related.c).where(related.c.relation.is_not(None))
 
 
-def _moments(tables: SpatialTables, picked: FromClause, placed: FromClause, *, simulated: bool) -> Subquery:
+def _moments(tables: TablesByName, picked: FromClause, placed: FromClause, *, simulated: bool) -> Subquery:
     """Return the nodes with their object's identity, and the id that a row of their moment's event would have."""
-    node, target = tables.node, tables.object.alias("target")
+    node, target = tables["task_tree_node"], tables["object"].alias("target")
     first_id = node.c.id.bitwise_rshift(_NUMBER_BITS).bitwise_lshift(_NUMBER_BITS)
     ended = first_id + node.c.end_sequence.bitwise_lshift(_SLOT_BITS)
     return union_all(
@@ -643,11 +632,11 @@ def _moments(tables: SpatialTables, picked: FromClause, placed: FromClause, *, s
     ).subquery("moment")
 
 
-def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, same: bool) -> Subquery:
+def _placed_boxes(tables: TablesByName, moments: Subquery, boxes: Subquery, *, same: bool) -> Subquery:
     """Return the moments with the boxes in the map: of the picked up or placed object itself, or of all others."""
     name = "one" if same else "other"
-    added, then = tables.object.alias(f"{name}_added"), tables.object.alias(f"{name}_then")
-    later, removal, pose = tables.object.alias(f"{name}_later"), tables.removal.alias(), tables.pose.alias()
+    added, then, later = (tables["object"].alias(f"{name}_{each}") for each in ("added", "then", "later"))
+    removal, pose = tables["object_removal"].alias(), tables["pose"].alias()
     box = boxes.alias(f"{name}_box")
     last = (
         select(func.max(later.c.id))
@@ -661,7 +650,7 @@ def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, 
         .where(removal.c.id <= moments.c.moment)
     )
     # Joined, because SQLite would compute a subquery in the columns once for each use of a column.
-    slid = tables.joint_change.alias(f"{name}_slid")
+    slid = tables["joint_change"].alias(f"{name}_slid")
     last_change = _last_change(tables, added, box, moments)
     centre = [box.c[f"c{axis}"] + box.c[f"a{axis}"] * func.coalesce(slid.c.position, 0.0) for axis in _AXES]
     rotation = _rotation(pose)
@@ -693,9 +682,9 @@ def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, 
     )
 
 
-def _last_change(tables: SpatialTables, added: FromClause, box: FromClause, moments: Subquery) -> ColumnElement[int]:
+def _last_change(tables: TablesByName, added: FromClause, box: FromClause, moments: Subquery) -> ColumnElement[int]:
     """Return the id of the last change of the joint that slides a box."""
-    change, moved = tables.joint_change.alias(), tables.object.alias()
+    change, moved = tables["joint_change"].alias(), tables["object"].alias()
     return (
         select(func.max(change.c.id))
         .join_from(change, moved, same_episode(moved, change, moved.c.id == change.c.object_id))

@@ -573,7 +573,8 @@ async def _grow(
     dtype = united.accepted[name].dtype
     remedy = ": rename your table or view, then run `pycrorm rebuild`" if "already exists" in reason else ""
     reason = f"the database refuses the tables of {dtype}: {' '.join(reason.split())}{remedy}"
-    grown = await target.grow(connection, generation, generation.layout.with_unmade(name, reason))
+    unmade = generation.layout.unmade | {name: reason}
+    grown = await target.grow(connection, generation, msgspec.structs.replace(generation.layout, unmade=unmade))
     _log.warning("%s; episodes that use this type are parked, all others continue", reason)
     return grown
 

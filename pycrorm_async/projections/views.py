@@ -39,7 +39,6 @@ from pycrorm_async.events.fields import table_name
 from pycrorm_async.projections.columns import (
     CORE,
     EPISODE,
-    LINK_BOX,
     MARKED,
     OF_NO_EPISODE,
     OWN,
@@ -52,7 +51,6 @@ from pycrorm_async.projections.columns import (
 )
 from pycrorm_async.projections.derived_views import (
     CONCEPT_VIEWS,
-    SpatialTables,
     absent,
     event_of,
     member,
@@ -72,9 +70,6 @@ _UNITED_MAX = 400
 
 _PICKED = "pick_up_action"
 _PLACED = "place_action"
-_OF_PICK_UPS = ("task_tree_node", "object", "object_removal", "pose", "process_metadata")
-_OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_change")
-"""The tables of `PickUpWithContextView` and of `spatial_relation`."""
 
 _declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
 _is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
@@ -169,15 +164,13 @@ def _cut(tables: Tables, name: str) -> View:
 
 
 def _pick_ups_with_context(tables: Tables, picked: _Leaf, dtypes: tuple[str, ...]) -> View:
-    node, object_, removal, pose, episode = (tables[name] for name in _OF_PICK_UPS)
     rows = _with_simulations(tables, picked).subquery("picked")
-    return tables.shown(pick_ups_with_context(rows, node, object_, removal, pose, episode, dtypes), node)
+    return tables.shown(pick_ups_with_context(tables, rows, dtypes), tables["task_tree_node"])
 
 
 def _spatial_relations(tables: Tables, picked: _Leaf, placed: _Leaf) -> View:
     rows = [_with_simulations(tables, each).subquery(name) for each, name in ((picked, "picked"), (placed, "placed"))]
-    read = SpatialTables(*(tables[name] for name in _OF_RELATIONS))
-    return spatial_relations(read, tables[LINK_BOX], *rows, simulated=tables.simulated)
+    return spatial_relations(tables, *rows, simulated=tables.simulated)
 
 
 def _with_simulations(tables: Tables, leaf: _Leaf) -> View:
@@ -201,8 +194,7 @@ def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
 
 def _process_metadata(tables: Tables) -> Select[Any]:
     episodes = tables["process_metadata"]
-    line = world_line(tables["object"], tables["object_removal"], episodes.c.id)
-    world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
+    world = func.coalesce(episodes.c.world, episodes.c.entered_world, world_line(tables, episodes.c.id)).label("world")
     columns = columns_in_order(episodes)
     first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
     return select(first, *others, _end(episodes.c.created_at, episodes).label("ended_at"), _duration_s(episodes))
@@ -341,9 +333,7 @@ def _robot_state(tables: Tables) -> Select[Any]:
 
 def _root_failure(tables: Tables) -> Select[Any]:
     nodes = tables["task_tree_node"]
-    return root_failures(nodes, tables["object"]).add_columns(
-        _end(nodes.c.start_time, nodes).label("end_time"), _duration_s(nodes)
-    )
+    return root_failures(tables).add_columns(_end(nodes.c.start_time, nodes).label("end_time"), _duration_s(nodes))
 
 
 def _pose(tables: Tables) -> Select[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any, TypeAlias
@@ -171,6 +171,11 @@ class NodeSummary:
     outcome: str | None = field(default=None, compare=False)
 
 
+_OF_EPISODE = {each.name for each in fields(EpisodeSummary)} & {*ProcessMetaData.__table__.c.keys()}
+_OF_NODE = {each.name for each in fields(NodeSummary)} & {*TaskTreeNode.__table__.c.keys()}
+_OF_EPISODE -= {"id", "thought_by"}
+_OF_NODE -= {"status"}
+"""The fields that are columns of the same name."""
 _AT_ONCE = 500
 """Bounds the episodes that one query names, because a database takes 32,766 parameters."""
 
@@ -206,31 +211,14 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
             number=row.id,
             id=row.uuid,
             started_at=row.created_at,
-            ended_at=row.ended_at,
             duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
-            status=row.status,
-            description=row.description,
-            created_by=row.created_by,
             nodes=nodes,
             failed=int(failed),
             failed_actions=int(failed_actions),
-            simulated=row.simulated,
             thought_by=simulating.get(row.id),
-            continues=row.continues,
-            continued_in=row.continued_in,
-            end_sequence=row.end_sequence,
-            plan=row.plan,
-            plan_sha256=row.plan_sha256,
-            git_commit=row.git_commit,
-            git_dirty=row.git_dirty,
-            world=row.world,
-            libraries=row.libraries,
-            settings=row.settings,
-            clock_synchronized=row.clock_synchronized,
-            clock_error_us=row.clock_error_us,
             robots=tuple(robots.get(row.id, ())),
             tags=tuple(tags.get(row.id, ())),
-            metadata=row.metadata,
+            **{name: getattr(row, name) for name in _OF_EPISODE},
         )
         for row in rows
         for nodes, failed, failed_actions in [counts.get(row.id, (0, 0, 0))]
@@ -312,27 +300,18 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
         considered, offered = map(int, places.get(row.id, (0, 0)))
         children.setdefault(row.parent_id, []).append(
             NodeSummary(
-                id=row.id,
-                parent_id=row.parent_id,
                 depth=0,
-                dtype=row.dtype,
-                kind=row.kind,
                 parameters=parameters,
                 status=row.status.name if isinstance(row.status, TaskStatus) else row.status,
                 started_at=row.start_time,
                 duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
-                reason=row.reason,
-                outcome=row.outcome,
-                failure_message=row.failure_message,
-                simulated=row.simulated,
                 thoughts=tuple(simulations.get(row.id, ())),
                 sequence=row_key(row.id).sequence,
-                end_sequence=row.end_sequence,
                 observations=observations.get(row.id, 0),
                 considered=considered,
                 offered=offered,
                 detected=detected.get(row.id, 0),
-                start_ns=row.start_ns,
+                **{name: getattr(row, name) for name in _OF_NODE},
             )
         )
     return list(_depth_first(children))
