@@ -39,9 +39,10 @@ from pycrorm_async.plan import BaseMotion
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.record.declarations import Declarations
+from pycrorm_async.record.declarations import KnownTypes
 from pycrorm_async.record.plan_recorder import current_episode
-from pycrorm_async.record.values import encode_parameter
+from pycrorm_async.record.plan_types import Declarations
+from pycrorm_async.record.values import read_parameters
 from pycrorm_async.world import BulletWorld
 
 _TASKS = 100
@@ -156,11 +157,10 @@ def _parts(action: NothingActionPerformable, queue: RecorderQueue, memory: Memor
     assert episode is not None
     assert episode.world is not None
     world = episode.world
-    declared = Declarations().of(type(action), lambda _: None)
-    values = [(field, enum, getattr(action, field.name)) for field, _, enum in declared.fields]
+    declared = Declarations(KnownTypes(lambda _dtype: None)).of(type(action), lambda _: None)
 
     def parameters() -> dict[str, Any]:
-        return {field.name: encode_parameter(field, enum, value, episode) for field, enum, value in values}
+        return read_parameters(action, declared.fields, episode, {})
 
     start = NodeStarted("action", 2, declared.fingerprint, parameters(), world.robot())
     payload = encode(start)

@@ -71,10 +71,11 @@ from pycrorm_async.queue.spool import Spool
 from pycrorm_async.recall.answer import Answer
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, ProcessCases, Recall
-from pycrorm_async.record.episode import Episode
+from pycrorm_async.record.declarations import KnownTypes
 from pycrorm_async.record.episode_writer import Emitter, Faults, OpenEpisodes, PlanSource, Provenance, read_labels
 from pycrorm_async.record.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
-from pycrorm_async.record.plan_recorder import Observations, Recorder, current_episode, observations
+from pycrorm_async.record.plan_recorder import Episode, Recorder, current_episode
+from pycrorm_async.record.plan_types import built_in_declaration
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import Missing
 from pycrorm_async.report.write import Report
@@ -110,7 +111,6 @@ class Parts(NamedTuple):
     emitter: Emitter
     recorder: Recorder
     recording: Recording
-    observations: Observations
     experience: PickUpExperience
 
     async def flush(self) -> None:
@@ -144,7 +144,6 @@ class Parts(NamedTuple):
             (watcher, self.recorder),
             (called_performs, self.recorder.calls),
             (experience, self.experience),
-            (observations, self.observations),
         )
 
 
@@ -513,7 +512,7 @@ class Memory:
 
         Raises `Unrecordable` with `on_unrecordable="refuse"` only.
         """
-        (self._forked_parts or self._open_parts).observations.observe(name, values, node=node)
+        (self._forked_parts or self._open_parts).recorder.observe(name, values, node=node)
 
     # --- subscribing ------------------------------------------------------------------------------------------
 
@@ -736,18 +735,15 @@ class Memory:
         emitter = Emitter(queue, self._settings)
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         episodes = OpenEpisodes(emitter, self._clock)
-        recorder = Recorder(emitter, episodes=episodes, software=__version__, provenance=provenance)
-        recording = Recording(
-            emitter, episodes, recorder.known_types, declared, software=__version__, provenance=provenance
-        )
+        known = KnownTypes(built_in_declaration)
+        recording = Recording(emitter, episodes, known, declared, software=__version__, provenance=provenance)
         return Parts(
             queue,
             writer,
             reading,
             emitter,
-            recorder,
+            Recorder(recording),
             recording,
-            Observations(emitter, recorder),
             PickUpExperience(reading, lambda: self.recall.reader),
         )
 

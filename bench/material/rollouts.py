@@ -38,9 +38,9 @@ from pycrorm_async.plan.actions import (
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.record.declarations import declared_type
-from pycrorm_async.record.episode_writer import Emitter
-from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.declarations import DeclaredType
+from pycrorm_async.record.episode_writer import Emitter, EpisodeOpening, EpisodeWriter
+from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.settings import Settings
 from tests.databases import ask
 
@@ -303,7 +303,7 @@ class Recording:
         name = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
         self.queue = RecorderQueue.create(spool, settings=settings, clock=clock, recorder=name, offered=True)
         self._emitter = Emitter(self.queue, settings)
-        self._episode = EpisodeId(b"")
+        self._episode = self._episode_writer(EpisodeId(b""))
         self._milk = ObjectReference(0, 0)
         self.root = 0
         self.events = 0
@@ -318,7 +318,7 @@ class Recording:
     def begin(self, began_ns: int) -> None:
         """Begin an episode with its root and the milk."""
         self._now_ns = began_ns
-        self._episode = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
+        self._episode = self._episode_writer(episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10)))
         self._put(EpisodeStarted("rollouts", "bench", "here", __version__, "3"))
         self.root = self._put(NodeStarted("root"))
         milk = self._put(ObjectAdded(MILK.name, MILK.type, _pose(MILK.place)))
@@ -357,7 +357,10 @@ class Recording:
 
     def _put(self, event: Happening) -> int:
         self.events += 1
-        return self._emitter.put(self._episode, event)
+        return self._episode.put(event)
+
+    def _episode_writer(self, name: EpisodeId) -> EpisodeWriter:
+        return EpisodeWriter(self._emitter, name, EpisodeOpening("rollouts", "bench"))
 
     def _written(self, value: object) -> Any:
         match value:

@@ -289,16 +289,6 @@ class Heading(NamedTuple):
     version: int
 
 
-class Receipt:
-    """The sequence of one event, 0 until the event is written.
-
-    The queue sets it in the same step as it writes the event. So the caller of a put that raised, as Ctrl-C makes it do
-    at any call, can determine whether the event was written before.
-    """
-
-    sequence = 0
-
-
 class Record(NamedTuple):
     """One event with its complete envelope. A recorder-level record has no episode and sequence 0.
 

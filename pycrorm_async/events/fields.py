@@ -186,17 +186,11 @@ def fault_in_fields(fields: Sequence[FieldDeclared]) -> str | None:
     """Return the reason, naming the field, why these fields cannot be columns of one table; None if they can."""
     if len(fields) > _FIELDS_MAX:
         return _too_many(len(fields))
-    owners: dict[str, str] = {}
+    accepted = AcceptedFields()
     for field in fields:
-        fault = _fault_in_names(field, owners)
-        if fault is not None:
+        if (fault := accepted.fault_in(field)) is not None:
             return fault
-        owners[field.name.lower()] = owners[field.column.lower()] = field.name
-    for kind in _SPECIAL_KINDS:
-        first = next((field.name for field in fields if field.type == kind), None)
-        misnamed = _fields_named(fields, kind) - {first}
-        if misnamed:
-            return _misnamed(misnamed.pop(), kind)
+        accepted.accept(field)
     return None
 
 
@@ -275,10 +269,6 @@ def _fault_in_names(field: FieldDeclared, owners: Mapping[str, str]) -> str | No
         if name in owners:
             return f"fields {owners[name]!r} and {field.name!r} would share the name {name!r}"
     return None
-
-
-def _fields_named(fields: Iterable[FieldDeclared], kind: str) -> set[str]:
-    return {field.name for field in fields if _is_named(field, kind)}
 
 
 def _is_named(field: FieldDeclared, kind: str) -> bool:

@@ -25,6 +25,8 @@ NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
 NodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"]
 """The names of `TaskStatus`."""
 EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST"]
+LOSES_OPEN_NODES: Final[frozenset[EpisodeStatus]] = frozenset({"INTERRUPTED", "LOST"})
+"""The statuses of an episode whose nodes without an end are LOST: Ctrl-C came inside a hook, or the process died."""
 
 FieldType: TypeAlias = Literal[
     "integer", "real", "text", "boolean", "datetime", "enum", "pose", "object", "list", "dict"

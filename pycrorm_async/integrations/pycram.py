@@ -29,8 +29,7 @@ from pycrorm_async.events.types import NodeStatus, SeenValue
 from pycrorm_async.integrations.foreign_package import ForeignPackage
 from pycrorm_async.integrations.pycram_values import Change, PyCRAMEpisodes, PyCRAMValues, RunningNode
 from pycrorm_async.memory import Memory
-from pycrorm_async.record.declarations import RecordedKind
-from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.declarations import DeclaredType, RecordedKind
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings, Writer

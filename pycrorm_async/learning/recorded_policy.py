@@ -22,7 +22,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.orm import LearnPolicyAction, Observation, ObservationValue
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.record.plan_recorder import observations
+from pycrorm_async.record.plan_recorder import observing
 
 EPISODES_MAX = 10_000
 """Bounds the training episodes that are recorded by id, so that they fit into one event; `episode_count` counts all."""
@@ -79,7 +79,7 @@ async def record_policy(
 
 def keep_policy(name: str, policy: Policy) -> None:
     """Record the content of a policy that is used, in the open episode; once for each opened memory."""
-    here = observations.get()
+    here = observing()
     if here is not None:
         here.keep(_OBSERVATION, name, lambda: Blob(encode_policy(policy), _MEDIA_TYPE))
 

@@ -79,26 +79,6 @@ from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, yaw_quaternion
 from pycrorm_async.world.urdf import Drive
 
-__all__ = [
-    "FaceAtPerformable",
-    "LookAtActionPerformable",
-    "MoveAndPickUpPerformable",
-    "MoveTorsoActionPerformable",
-    "NavigateActionPerformable",
-    "ParkArmsActionPerformable",
-    "PickUpActionPerformable",
-    "PlaceActionPerformable",
-    "SetGripperActionPerformable",
-    "CloseActionPerformable",
-    "GraspingActionPerformable",
-    "GripActionPerformable",
-    "OpenActionPerformable",
-    "ReleaseActionPerformable",
-    "DetectActionPerformable",
-    "TransportActionPerformable",
-]
-
-
 # === basic ====================================================================================================
 
 

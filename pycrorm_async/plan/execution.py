@@ -24,7 +24,7 @@ current by then.
 
 Concurrent plans cannot disturb each other: the current node, the execution context and the time of the last yield are
 context variables, which every asyncio task copies when it is created. A suspended plan that is dropped is closed in
-another context; `_restore_parent` then leaves that context's current node alone.
+another context, whose current node does not change.
 
 A call of `super().perform()` on the same designator belongs to the node of the outer call. It is recognised by two
 facts: the current node's designator is this very object, and its class performs another function than this one.
@@ -42,7 +42,7 @@ import inspect
 import sys
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from contextvars import ContextVar, Token
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import CoroutineType
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 from weakref import ref
@@ -50,15 +50,7 @@ from weakref import ref
 from pycrorm_async.clock import monotonic_ns
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.plan.failures import Resource, ResourceDeadlock, is_plan_failure
-from pycrorm_async.plan.task import (
-    ExecutionContext,
-    Hold,
-    Performable,
-    TaskTreeNode,
-    collecting,
-    current_node,
-    execution_context,
-)
+from pycrorm_async.plan.task import Performable, TaskTreeNode, collecting, current_node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.bullet import current_world
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType, Pose
@@ -119,7 +111,7 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
     """Return `perform` with the steps of a node around it."""
 
     @functools.wraps(perform)
-    async def run(self: Performable, unstarted: Unstarted | None) -> Any:
+    async def run(self: Performable, unstarted: Unstarted | None) -> Any:  # noqa: C901  see above
         if unstarted:
             unstarted[0].waiting -= 1
             unstarted.clear()
@@ -128,7 +120,9 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
             return await perform(self)
         now_ns = monotonic_ns()
         if now_ns - _last_yield_ns.get() > YIELD_INTERVAL_NS:
-            now_ns = await _yield_to_loop()
+            await asyncio.sleep(0)
+            now_ns = monotonic_ns()
+            _last_yield_ns.set(now_ns)
         around, claim = execution_context.get(), None
         if around is not None:
             claim = await around.enter(self)
@@ -154,7 +148,10 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
                 raise
             finally:
                 node.ended_ns = monotonic_ns()
-                _restore_parent(token)
+                try:  # noqa: SIM105  `suppress` takes longer
+                    current_node.reset(token)
+                except ValueError:
+                    pass  # a suspended plan that was dropped is closed in another context, whose node must not change
                 if observer is not None:
                     observer.node_ended(node)
                 # The failure's traceback holds this frame and the node holds the failure: break the reference cycle.
@@ -175,14 +172,6 @@ def _is_overridden(designator: Performable, perform: Callable[..., Any]) -> bool
     return getattr(type(designator).perform, "__wrapped__", None) is not perform
 
 
-async def _yield_to_loop() -> int:
-    """Yield to the event loop once and return the monotonic time afterwards, ns."""
-    await asyncio.sleep(0)
-    now_ns = monotonic_ns()
-    _last_yield_ns.set(now_ns)
-    return now_ns
-
-
 def _status(error: BaseException, around: ExecutionContext | None) -> TaskStatus:
     """Return the status of a node that ended with this exception."""
     if isinstance(error, asyncio.CancelledError):
@@ -191,15 +180,6 @@ def _status(error: BaseException, around: ExecutionContext | None) -> TaskStatus
     if isinstance(error, KeyboardInterrupt):
         return TaskStatus.CANCELLED
     return TaskStatus.FAILED if is_plan_failure(error) else TaskStatus.ERROR
-
-
-def _restore_parent(token: Token[TaskTreeNode | None]) -> None:
-    """Make the parent the current node again."""
-    try:
-        current_node.reset(token)
-    except ValueError:
-        # A suspended plan that was dropped is closed in another context, whose current node must not change.
-        return
 
 
 # === observer =================================================================================================
@@ -244,6 +224,31 @@ class Cells:
     occupied: int
     hidden: int
     free: int
+
+
+@dataclass(slots=True)
+class Search:
+    """What a location designator found.
+
+    Attributes:
+        location: the designator's class name.
+        node: the node that resolves it.
+        offered: the first places it offered, and the last one.
+        taken: index of the offered place that was taken; None if none was.
+        considered: number of places it tried.
+        refused: the first places that it tried in vain, in the order of the search.
+        offered_beyond: number of further places that it offered.
+        cells: the places in its costmaps; None if it has none, or ended before they were made.
+    """
+
+    location: str
+    node: TaskTreeNode | None
+    offered: list[Candidate] = field(default_factory=list)
+    taken: int | None = None
+    considered: int = 0
+    refused: list[Refusal] = field(default_factory=list)
+    offered_beyond: int = 0
+    cells: Cells | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,30 +308,10 @@ class PlanObserver(Protocol):
         """Called exactly once for every started node, after its status, failure and result are set."""
         ...
 
-    def location_resolved(
-        self,
-        *,
-        location: str,
-        offered: tuple[Candidate, ...],
-        taken: int | None,
-        considered: int,
-        refused: tuple[Refusal, ...],
-        offered_beyond: int,
-        cells: Cells | None,
-        node: TaskTreeNode | None,
-    ) -> None:
-        """Called after a location designator was resolved or iterated.
+    def location_resolved(self, search: Search) -> None:
+        """Called once after a location designator was resolved or iterated.
 
-        Args:
-            location: the designator's class name.
-            offered: the first places it offered, and the last one.
-            taken: index of the offered place that was taken; None if none was.
-            considered: number of places it tried.
-            refused: the first places that it tried in vain, in the order of the search.
-            offered_beyond: number of further places that it offered.
-            cells: the places in its costmaps; None if it has none, or ended before they were made.
-
-        Called once per resolution, in another context if a loop over places was dropped.
+        Called in another context if a loop over places was dropped.
         """
         ...
 
@@ -450,6 +435,66 @@ called_performs: ConnectedVar[CalledPerforms] = ConnectedVar("called_performs")
 """The calls of the context's episode, or of its memory outside an episode; None without a memory."""
 
 
+# === execution context ========================================================================================
+#
+# The execution context of a node: the monitors around it, and the arbiter and claims of its parallel branches.
+#
+# Most plans have none; then a perform reads one ContextVar only. Otherwise `ExecutionContext.enter` runs before the
+# node is created, so that a node that is interrupted or waits for a part of the robot has not started yet.
+
+
+class Interrupter(Protocol):
+    """Interrupts the plan inside it when a condition holds; the watch of a monitor."""
+
+    @property
+    def fired(self) -> bool:
+        """True once it has interrupted the plan."""
+        ...
+
+    async def check(self) -> None:
+        """Interrupt the plan and raise `CancelledError` if the condition holds."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutionContext:
+    """The monitors and claims that apply in a context; asyncio tasks inherit it.
+
+    Attributes:
+        watches: the watches of all enclosing monitors, the outermost first.
+        arbiter: the arbiter of the outermost enclosing parallel expression.
+        claim: the claim of the nearest ancestor that holds parts of the robot; its `parent` leads to the others.
+    """
+
+    watches: tuple[Interrupter, ...] = ()
+    arbiter: Arbiter | None = None
+    claim: Claim | None = None
+
+    @property
+    def interrupted(self) -> bool:
+        """True if an enclosing monitor has interrupted its operand."""
+        return any(watch.fired for watch in self.watches)
+
+    async def enter(self, designator: Performable) -> Claim | None:
+        """Check the monitors, then wait for the parts of the robot that the designator needs.
+
+        The caller releases the returned claim, if there is one, when the node has ended.
+
+        Raises:
+            CancelledError: a monitor's condition holds.
+            ResourceDeadlock: the wait for a part of the robot would never end.
+        """
+        if self.watches and not self.interrupted:
+            for watch in self.watches:
+                await watch.check()
+        if self.arbiter is None:
+            return None
+        return await self.arbiter.claim(designator)
+
+
+execution_context: ContextVar[ExecutionContext | None] = ContextVar("execution_context", default=None)
+
+
 # === resource arbiter =========================================================================================
 #
 # Arbitrate the parts of the robot between the branches of a parallel expression.
@@ -486,7 +531,7 @@ class Claim:
 
     __slots__ = ("_arbiter", "_token", "designator", "granted", "parent", "parts")
 
-    def __init__(self, arbiter: Arbiter, designator: Performable, parts: frozenset[Part], parent: Hold | None) -> None:
+    def __init__(self, arbiter: Arbiter, designator: Performable, parts: frozenset[Part], parent: Claim | None) -> None:
         self.designator = designator
         self.parts = parts
         self.parent = parent
@@ -495,7 +540,7 @@ class Claim:
         self._arbiter = arbiter
         self._token: Token[ExecutionContext | None] | None = None
 
-    def above(self) -> Iterator[Hold]:
+    def above(self) -> Iterator[Claim]:
         """Yield the claims of the ancestor nodes, nearest first."""
         each = self.parent
         while each is not None:
@@ -594,7 +639,7 @@ class Arbiter:
         earlier = self._waiting[: self._waiting.index(claim)]
         return [each for each in earlier if each.parts & claim.parts]
 
-    def _waits_for(self, waiter: Claim, ends: set[Hold]) -> bool:
+    def _waits_for(self, waiter: Claim, ends: set[Claim]) -> bool:
         """Return whether `waiter` can be granted, or may be, only after one of `ends` has ended."""
         ahead, seen = [waiter], set()
         while ahead:
@@ -609,7 +654,7 @@ class Arbiter:
             ahead += self._earlier_rivals(each)
         return False
 
-    def _waiting_in(self, holder: Hold) -> list[Claim]:
+    def _waiting_in(self, holder: Claim) -> list[Claim]:
         """Return the claims that wait inside the holder, which cannot end before they do."""
         return [each for each in self._waiting if holder in each.above()]
 

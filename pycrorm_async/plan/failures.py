@@ -32,68 +32,6 @@ from pycrorm_async.world.pose import Arms, Pose
 if TYPE_CHECKING:
     from pycrorm_async.world.urdf import RobotDescription
 
-__all__ = [
-    "PlanFailure",
-    "PlanFailures",
-    "IKError",
-    "ResourceDeadlock",
-    "NotALanguageExpression",
-    "FailureDiagnosis",
-    "LowLevelFailure",
-    "ActionlibActionTimeout",
-    "ManipulationLowLevelFailure",
-    "EnvironmentManipulationGoalNotReached",
-    "ManipulationGoalNotReached",
-    "ManipulationPoseUnreachable",
-    "GripperLowLevelFailure",
-    "GripperClosedCompletely",
-    "GripperGoalNotReached",
-    "NavigationLowLevelFailure",
-    "NavigationGoalNotReached",
-    "NavigationPoseUnreachable",
-    "PerceptionLowLevelFailure",
-    "PerceptionObjectNotFound",
-    "PerceptionObjectNotInWorld",
-    "TorsoLowLevelFailure",
-    "TorsoGoalNotReached",
-    "TorsoGoalUnreachable",
-    "HighLevelFailure",
-    "DeliveringFailed",
-    "EnvironmentManipulationImpossible",
-    "EnvironmentUnreachable",
-    "FetchingFailed",
-    "LookingHighLevelFailure",
-    "ManipulationGoalInCollision",
-    "NavigationHighLevelFailure",
-    "NavigationGoalInCollision",
-    "ObjectNowhereToBeFound",
-    "ObjectUndeliverable",
-    "ObjectUnfetchable",
-    "ObjectUnreachable",
-    "SearchingFailed",
-    "Task",
-    "Grasping",
-    "Looking",
-    "ObjectPoseMisestimation",
-    "SuccessfulCompletion",
-    "ObjectNotFound",
-    "LocomotorFailure",
-    "ArmFailure",
-    "ObjectLost",
-    "SensorFailure",
-    "IllPosedGoalFailure",
-    "CapabilityAbsenceFailure",
-    "ReachabilityFailure",
-    "TorsoFailure",
-    "ConfigurationNotReached",
-    "Timeout",
-    "EndEffectorFailure",
-    "ObjectUnavailable",
-    "SustainedFailure",
-    "ReasoningError",
-    "CollisionError",
-]
-
 
 class PlanFailure(Exception):
     """A plan, action or motion did not succeed.
@@ -102,6 +40,9 @@ class PlanFailure(Exception):
         message: human-readable; also `str(failure)`.
         data: the further arguments, unchanged; recorded with the message.
     """
+
+    __is_plan_failure__ = True
+    """A memory records it as an outcome, and not as a fault."""
 
     def __init__(self, message: str = "", *data: object) -> None:
         super().__init__(message, *data)

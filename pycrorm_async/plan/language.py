@@ -58,7 +58,7 @@ from numbers import Real
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, NoReturn, Self, TypeAlias, TypeVar
 
-from pycrorm_async.plan.execution import Arbiter, is_wrapped, wrap_perform
+from pycrorm_async.plan.execution import Arbiter, ExecutionContext, execution_context, is_wrapped, wrap_perform
 from pycrorm_async.plan.failures import (
     NOTHING,
     FieldHidesMethod,
@@ -76,14 +76,7 @@ from pycrorm_async.plan.failures import (
 from pycrorm_async.plan.field_types import check_properties, record_arguments
 from pycrorm_async.plan.geometry import lifting_arms
 from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike, require_robot
-from pycrorm_async.plan.task import (
-    ExecutionContext,
-    NodeKind,
-    current_node,
-    execution_context,
-    join_tasks,
-    raise_errors,
-)
+from pycrorm_async.plan.task import NodeKind, current_node, join_tasks, raise_errors
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, NoWorld
 
@@ -91,8 +84,8 @@ from pycrorm_async.world.pose import Arms, NoWorld
 #
 # Operators that combine plans: `a + b`, `a - b`, `a | b`, `a ^ b`, `a * 3`, `a >> Monitor(…)`.
 #
-# Designators and descriptions have them. Each operator creates an expression of `plan.language`, which refuses an
-# operand that is not performable immediately and names it.
+# Designators and descriptions have them. Each operator creates an expression, which refuses an operand that is not
+# performable immediately and names it.
 
 
 class Composable:
@@ -106,29 +99,29 @@ class Composable:
 
     def __add__(self, other: Composable) -> Sequential:
         """Perform this one, then the other."""
-        return _expressions().sequential(self, other)
+        return Sequential(self, other)
 
     def __sub__(self, other: Composable) -> TryInOrder:
         """Perform this one, and the other only if it fails."""
-        return _expressions().try_in_order(self, other)
+        return TryInOrder(self, other)
 
     def __or__(self, other: Composable) -> Parallel:
         """Perform both in parallel; both must succeed."""
-        return _expressions().parallel(self, other)
+        return Parallel(self, other)
 
     def __xor__(self, other: Composable) -> TryAll:
         """Perform both in parallel; one must succeed."""
-        return _expressions().try_all(self, other)
+        return TryAll(self, other)
 
     def __mul__(self, times: int) -> Repeat:
         """Perform this one `times` times."""
-        return _expressions().repeat(self, times)
+        return Repeat(self, times)
 
     __rmul__ = __mul__
 
     def __rshift__(self, monitor: Monitor) -> Monitor:
         """Perform this one until it ends or the monitor's condition holds."""
-        return _expressions().watch_operand(self, monitor)
+        return watch_operand(self, monitor)
 
     # Python calls these only if the left operand lacks the operator, so it is not performable: the constructors raise.
 
@@ -145,22 +138,7 @@ class Composable:
         return Composable.__xor__(other, self)
 
     def __rrshift__(self, other: Composable) -> Monitor:
-        return _expressions().watch_operand(other, self)
-
-
-class _Expressions(NamedTuple):
-    sequential: type[Sequential]
-    try_in_order: type[TryInOrder]
-    parallel: type[Parallel]
-    try_all: type[TryAll]
-    repeat: type[Repeat]
-    watch_operand: Callable[[Composable, Composable], Monitor]
-
-
-def _expressions() -> _Expressions:
-    """Import the expressions when an operator is used: they are designators, whose base class is `Composable`."""
-
-    return _Expressions(Sequential, TryInOrder, Parallel, TryAll, Repeat, watch_operand)
+        return watch_operand(other, self)
 
 
 # === action description =======================================================================================

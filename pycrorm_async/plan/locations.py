@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 import numpy as np
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan.execution import Candidate, Cells, Refusal, recorder
+from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Search, recorder
 from pycrorm_async.plan.failures import (
     EnvironmentUnreachable,
     LookingHighLevelFailure,
@@ -416,42 +416,28 @@ class LocationDesignator(ABC):
 
     def __iter__(self) -> Generator[Location, None, None]:
         """Yield suitable places; the last one yielded counts as taken, or none if the iteration is exhausted."""
-        observer, node = recorder.get(), current_node.get()
-        offered: list[Candidate] = []
-        offered_beyond = 0
-        refused: list[Refusal] = []
-        cells: Cells | None = None
-        taken: int | None = None
-        considered = 0
+        observer, search = recorder.get(), Search(self._name(), current_node.get())
+        offered = search.offered
         try:
             for place in self._candidates():
                 if isinstance(place, Cells):
-                    cells = place
+                    search.cells = place
                     continue
-                considered += 1
+                search.considered += 1
                 if isinstance(place, Refusal):
-                    if len(refused) < REFUSALS_MAX:
-                        refused.append(place)
+                    if len(search.refused) < REFUSALS_MAX:
+                        search.refused.append(place)
                 elif place is not None:
                     if len(offered) == CANDIDATES_MAX:
                         offered.pop()
-                        offered_beyond += 1
-                    taken = len(offered)
+                        search.offered_beyond += 1
+                    search.taken = len(offered)
                     offered.append(Candidate(place.pose, place.reachable_arms, place.grasp, place.torso_height))
                     yield place
-                    taken = None
+                    search.taken = None
         finally:
             if observer is not None:
-                observer.location_resolved(
-                    location=self._name(),
-                    offered=tuple(offered),
-                    taken=taken,
-                    considered=considered,
-                    refused=tuple(refused),
-                    offered_beyond=offered_beyond,
-                    cells=cells,
-                    node=node,
-                )
+                observer.location_resolved(search)
 
 
 @dataclass(frozen=True)

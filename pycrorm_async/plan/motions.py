@@ -80,21 +80,6 @@ from pycrorm_async.world.queries import collisions_at
 from pycrorm_async.world.urdf import Drive, FieldOfView, Limits, PR2Description
 from pycrorm_async.world.world_copy import acting_robot
 
-__all__ = [
-    "MoveMotion",
-    "MoveTCPMotion",
-    "LookingMotion",
-    "MoveGripperMotion",
-    "MoveArmJointsMotion",
-    "MoveJointsMotion",
-    "DetectingMotion",
-    "WorldStateDetectingMotion",
-    "OpeningMotion",
-    "ClosingMotion",
-    "AccessingMotion",
-]
-
-
 # === looking ==================================================================================================
 #
 # Compute the joints of a robot's head that point its camera at a target: in closed form for the PR2, else by turns.
@@ -513,29 +498,7 @@ def _visibility(robot: CurrentRobot, camera: Pose, obj: Object) -> tuple[float, 
 #
 # Keep the robot chosen for the motions of the current context, and execute motions with its process modules.
 
-_chosen: ContextVar[tuple[RobotChoice, ...]] = ContextVar("_chosen", default=())
-
-
-class RobotChoice:
-    """A choice of process modules; inside its `with` block their methods execute the motions of the context."""
-
-    def __init__(self, name: str, modules: object, *, limits: Limits, collisions: bool) -> None:
-        self.name = name
-        self.modules = modules
-        self.limits = limits
-        self.collisions = collisions
-
-    def __enter__(self) -> Self:
-        _chosen.set((*_chosen.get(), self))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        _chosen.set(_chosen.get()[:-1])
-
-    def __repr__(self) -> str:
-        return f"<{self.name} robot>"
+_chosen: ContextVar[tuple[ChosenRobot, ...]] = ContextVar("_chosen", default=())
 
 
 def execute(motion: Performable, module: str) -> Awaitable[Any]:
@@ -775,7 +738,7 @@ class ProcessModules(MovingModules, Protocol):
     async def accessing(self, motion: AccessingMotion) -> None: ...
 
 
-class ChosenRobot(RobotChoice):
+class ChosenRobot:
     """A choice of process modules; inside its `with` block they execute the motions of the context.
 
     Args:
@@ -789,7 +752,22 @@ class ChosenRobot(RobotChoice):
     def __init__(
         self, name: str, modules: MovingModules, *, limits: Limits = Limits.SOFT, collisions: bool = False
     ) -> None:
-        super().__init__(name, modules, limits=limits, collisions=collisions)
+        self.name = name
+        self.modules = modules
+        self.limits = limits
+        self.collisions = collisions
+
+    def __enter__(self) -> Self:
+        _chosen.set((*_chosen.get(), self))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        _chosen.set(_chosen.get()[:-1])
+
+    def __repr__(self) -> str:
+        return f"<{self.name} robot>"
 
 
 def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> ChosenRobot:

@@ -17,7 +17,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeAlias, TypeVar
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError
@@ -55,6 +55,12 @@ class ObjectDesignator:
     object_type: ObjectType
     world_object: Object | None = field(default=None, repr=False)
     frozen_pose: Pose | None = None
+    __recorded_as__: ClassVar[str] = "Object"
+
+    @property
+    def row_of(self) -> Object | None:
+        """The object of the world of which a memory has a row."""
+        return self.world_object
 
     def __post_init__(self) -> None:
         _check(self, name=str, object_type=ObjectType)
@@ -79,6 +85,8 @@ class ObjectDesignator:
 class BelieveObject(ObjectDesignator):
     """An object with an assumed pose that is not in the world."""
 
+    __recorded_as__: ClassVar[str] = "BelieveObject"
+
     def __init__(self, name: str, object_type: ObjectType, pose: Pose) -> None:
         super().__init__(name, object_type, None, pose)
 
@@ -96,6 +104,12 @@ class ObjectPart(ObjectDesignator):
     """
 
     part_of: ObjectDesignator = field(kw_only=True)
+    __recorded_as__: ClassVar[str] = "ObjectPart"
+
+    @property
+    def row_of(self) -> Object | None:
+        """The whole."""
+        return self.part_of.row_of if isinstance(self.part_of, ObjectPart) else self.part_of.world_object
 
     def __init__(
         self,
@@ -143,6 +157,12 @@ class LocatedObject(ObjectDesignator):
     relative_pose: Pose = field(kw_only=True)
     reference: ObjectDesignator = field(kw_only=True)
     timestamp: datetime = field(kw_only=True)
+    __recorded_as__: ClassVar[str] = "LocatedObject"
+
+    @property
+    def row_of(self) -> Object | None:
+        """The reference, or the whole that it is a part of."""
+        return self.reference.row_of if isinstance(self.reference, ObjectPart) else self.reference.world_object
 
     def __init__(
         self,

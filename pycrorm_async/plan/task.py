@@ -8,61 +8,45 @@ not mix. To keep a whole tree without a memory, collect it: `with collected_tree
 from __future__ import annotations
 
 import asyncio
-from asyncio import AbstractEventLoop
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol
 
+import msgspec
+
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.plan.failures import Resource
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType, Pose
 
+NodeKind = Literal["root", "action", "motion", "language"]
 
-class TaskTreeNode:
+
+class TaskTreeNode(msgspec.Struct, eq=False):
     """One execution of a `perform`.
 
     Attributes:
         designator: the performed designator; None for the root of an episode.
         kind: root, action, motion or language.
         parent: the node it runs inside, in the same context; None for a top-level node.
+        started_ns, ended_ns: monotonic time, ns; `ended_ns` is None while it runs.
         status: see `TaskStatus`.
         failure: the exception it ended with, if any.
         result: the value that `perform` returned.
-        started_ns, ended_ns: monotonic time, ns; `ended_ns` is None while it runs.
         record: reserved for the observer that records the plan.
     """
 
-    __slots__ = (
-        "designator",
-        "ended_ns",
-        "failure",
-        "kind",
-        "parent",
-        "record",
-        "result",
-        "started_ns",
-        "status",
-    )
-
-    def __init__(
-        self,
-        designator: Performable | None,
-        kind: NodeKind,
-        parent: TaskTreeNode | None,
-        started_ns: int,
-    ) -> None:
-        self.designator = designator
-        self.kind: NodeKind = kind
-        self.parent = parent
-        self.status = TaskStatus.RUNNING
-        self.failure: BaseException | None = None
-        self.result: Any = None
-        self.started_ns = started_ns
-        self.ended_ns: int | None = None
-        self.record: Any = None
+    designator: Performable | None
+    kind: NodeKind
+    parent: TaskTreeNode | None
+    started_ns: int
+    status: TaskStatus = TaskStatus.RUNNING
+    failure: BaseException | None = None
+    result: Any = None
+    ended_ns: int | None = None
+    record: Any = None
 
     def __repr__(self) -> str:
         name = type(self.designator).__name__ if self.designator is not None else "root"
@@ -151,13 +135,9 @@ def collected_tree() -> Iterator[CollectedTree]:
         collecting.reset(token)
 
 
-# === protocols ================================================================================================
+# === performable ==============================================================================================
 #
-# Define protocols for the designators, arbiters and monitors that the execution of plans uses without importing them.
-#
-# Designators import the execution, which creates their nodes; with these protocols the execution need not import them.
-
-NodeKind = Literal["root", "action", "motion", "language"]
+# Designators import the execution, which creates their nodes; with a protocol the execution need not import them.
 
 
 class Performable(Protocol):
@@ -176,95 +156,6 @@ class Performable(Protocol):
     def resources(self) -> frozenset[Resource]:
         """Return the parts of the robot it uses exclusively from start to end."""
         ...
-
-
-class Hold(Protocol):
-    """A node's exclusive use of parts of the robot."""
-
-    @property
-    def parent(self) -> Hold | None:
-        """The hold of the nearest ancestor that has one."""
-        ...
-
-    def release(self) -> None:
-        """Release the parts after the node has ended."""
-        ...
-
-
-class Gate(Protocol):
-    """Lets a node start when the parts of the robot that it uses are free."""
-
-    @property
-    def loop(self) -> AbstractEventLoop:
-        """The event loop whose nodes it lets start."""
-        ...
-
-    async def claim(self, designator: Performable) -> Hold | None:
-        """Wait for the designator's parts and hold them, in the current execution context; None if it needs none.
-
-        Raises `ResourceDeadlock` if the wait would never end.
-        """
-        ...
-
-
-class Interrupter(Protocol):
-    """Interrupts the plan inside it when a condition holds."""
-
-    @property
-    def fired(self) -> bool:
-        """True once it has interrupted the plan."""
-        ...
-
-    async def check(self) -> None:
-        """Interrupt the plan and raise `CancelledError` if the condition holds."""
-        ...
-
-
-# === execution context ========================================================================================
-#
-# The execution context of a node: the monitors around it, and the arbiter and claims of its parallel branches.
-#
-# Most plans have none; then a perform reads one ContextVar only. Otherwise `ExecutionContext.enter` runs before the
-# node is created, so that a node that is interrupted or waits for a part of the robot has not started yet.
-
-
-@dataclass(frozen=True, slots=True)
-class ExecutionContext:
-    """The monitors and claims that apply in a context; asyncio tasks inherit it.
-
-    Attributes:
-        watches: the watches of all enclosing monitors, the outermost first.
-        arbiter: the arbiter of the outermost enclosing parallel expression.
-        claim: the claim of the nearest ancestor that holds parts of the robot; its `parent` leads to the others.
-    """
-
-    watches: tuple[Interrupter, ...] = ()
-    arbiter: Gate | None = None
-    claim: Hold | None = None
-
-    @property
-    def interrupted(self) -> bool:
-        """True if an enclosing monitor has interrupted its operand."""
-        return any(watch.fired for watch in self.watches)
-
-    async def enter(self, designator: Performable) -> Hold | None:
-        """Check the monitors, then wait for the parts of the robot that the designator needs.
-
-        The caller releases the returned claim, if there is one, when the node has ended.
-
-        Raises:
-            CancelledError: a monitor's condition holds.
-            ResourceDeadlock: the wait for a part of the robot would never end.
-        """
-        if self.watches and not self.interrupted:
-            for watch in self.watches:
-                await watch.check()
-        if self.arbiter is None:
-            return None
-        return await self.arbiter.claim(designator)
-
-
-execution_context: ContextVar[ExecutionContext | None] = ContextVar("execution_context", default=None)
 
 
 # === experience ===============================================================================================

@@ -18,6 +18,7 @@ from pycrorm_async.bulk_records import make
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id, row_key
 from pycrorm_async.events.types import (
     BLOB_KEY,
+    LOSES_OPEN_NODES,
     DesignatorTypeDeclared,
     FieldDeclared,
     NodeStarted,
@@ -111,7 +112,7 @@ class Rows:
             self.episode_ends.append(end)
         else:
             row.update(end._asdict())
-        if end.status == "LOST":
+        if end.status in LOSES_OPEN_NODES:
             self._lose_nodes(end.id)
 
     def _lose_nodes(self, number: int) -> None:

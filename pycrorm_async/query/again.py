@@ -54,8 +54,8 @@ from pycrorm_async.plan.objects import (
 )
 from pycrorm_async.projections.row_batch import is_missing
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
-from pycrorm_async.record.declarations import declared_type
-from pycrorm_async.record.parameters import FieldShape, Parameter, Unresolved, parameters_of, shape_of
+from pycrorm_async.record.declarations import FieldShape, shape_of
+from pycrorm_async.record.plan_types import Parameter, Unresolved, declared_type, parameters_of
 from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.bullet import BulletWorld, Object
 from pycrorm_async.world.model_boxes import with_boxes, with_mesh_files
@@ -150,7 +150,7 @@ def _made(kind: type, reader: _RowReader, outer: tuple[str, ...], replacements: 
 def names_in_rows(kind: type[Designator]) -> Mapping[str, str]:
     """Return the names of the declared fields by those of the parameters, which differ for reserved names."""
     fields = declared_type(kind, strict=False).fields
-    return {"_".join(each for each in path if each != ARGUMENTS): field.name for field, path, _ in fields}
+    return {"_".join(name for name in each.path if name != ARGUMENTS): each.name for each in fields}
 
 
 class _RowReader:

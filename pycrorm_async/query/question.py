@@ -22,7 +22,7 @@ from pycrorm_async.world.pose import Arms
 if TYPE_CHECKING:
     from pycrorm_async.query.frames import Library
     from pycrorm_async.query.named_queries import NodeSummary
-    from pycrorm_async.record.episode import Episode
+    from pycrorm_async.record.plan_recorder import Episode
 
 
 T = TypeVar("T")
@@ -205,7 +205,7 @@ def episode_name(episode: AskedEpisode) -> str:
         return episode.id
     if isinstance(episode, int | str) and not isinstance(episode, bool):
         return str(episode)
-    from pycrorm_async.record.episode import Episode  # here, because it loads the plan layer
+    from pycrorm_async.record.plan_recorder import Episode  # here, because it loads the plan layer
 
     if isinstance(episode, Episode):
         return str(episode)

@@ -19,6 +19,7 @@ from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     EVENT_TYPES,
+    LOSES_OPEN_NODES,
     EpisodeEnded,
     EpisodeStarted,
     EpisodeTagged,
@@ -272,7 +273,7 @@ class EpisodeReplay:
 
     def _end_episode(self, ended: EpisodeEnded) -> None:
         self.ended = ended
-        if ended.status == "LOST":  # the process died, so the outcome of its running nodes is unknown
+        if ended.status in LOSES_OPEN_NODES:
             for node in self.nodes.values():
                 if node.status == "RUNNING":
                     node.status = "LOST"

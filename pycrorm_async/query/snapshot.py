@@ -35,7 +35,7 @@ from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
 
 if TYPE_CHECKING:
-    from pycrorm_async.record.episode import Episode
+    from pycrorm_async.record.plan_recorder import Episode
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,7 +50,7 @@ from pycrorm_async.errors import (
     SpoolStuck,
     SpoolUnavailable,
 )
-from pycrorm_async.events.codec import Heading, Receipt
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.queue.format import (
     CHECKSUM_START,
@@ -169,7 +169,7 @@ class Appender:
 
     # --- putting -----------------------------------------------------------------------------------------------
 
-    def put(self, heading: Heading, payload: bytes, reserved: bool, receipt: Receipt | None = None) -> int:  # noqa: FBT001, C901  # the hot path
+    def put(self, heading: Heading, payload: bytes, reserved: bool) -> int:  # noqa: FBT001  # the hot path
         """Append one event as `RecorderQueue.put_nowait` does."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
@@ -232,8 +232,6 @@ class Appender:
                     self.open[episode] = (sequence, wall_ns, monotonic_ns)
                     if type_name == EPISODE_ENDED:
                         del self.open[episode]
-                if receipt is not None:
-                    receipt.sequence = sequence
 
                 if self._quiet:
                     self._wake()

@@ -42,7 +42,7 @@ from pycrorm_async.errors import (
     SpoolDamaged,
     SpoolUnavailable,
 )
-from pycrorm_async.events.codec import Heading, Receipt, Record
+from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.blobs import LiveBlobs
@@ -142,9 +142,7 @@ class RecorderQueue:
 
     # --- producers ---------------------------------------------------------------------------------------------
 
-    def put_nowait(
-        self, heading: Heading, payload: bytes, *, reserved: bool = False, receipt: Receipt | None = None
-    ) -> int:
+    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
         May be called from any thread, but not from a signal handler, which could interrupt the holder of the lock. A
@@ -152,7 +150,6 @@ class RecorderQueue:
 
         Args:
             reserved: the event may use the reserve (`spool_reserve_bytes`), which other events leave free.
-            receipt: gets the sequence in the same step as the event is written.
 
         Raises:
             SpoolFull: the event does not fit; `SpoolStuck` instead after `fail`.
@@ -162,7 +159,7 @@ class RecorderQueue:
             InternalError: an event before its `EpisodeStarted` or after its `EpisodeEnded`, or a record above
                 `record_bytes_max` that no segment can hold. The hooks put neither.
         """
-        return self._appender.put(heading, payload, reserved, receipt)
+        return self._appender.put(heading, payload, reserved)
 
     def put_blob(self, content: bytes) -> str:
         """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.

@@ -46,6 +46,7 @@ from pycrorm_async.errors import DamageError
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_key
 from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
+    LOSES_OPEN_NODES,
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
@@ -467,7 +468,7 @@ class EpisodeCases:
                     self._simulated = happening.simulated
                     self._wall_at_zero_ns = event.wall_ns - event.monotonic_ns
                 elif isinstance(happening, EpisodeEnded):
-                    if happening.status == "LOST":
+                    if happening.status in LOSES_OPEN_NODES:
                         cases += [each.case("LOST") for each in self._running.values()]
                     self._running.clear()
                     self._scopes.clear()

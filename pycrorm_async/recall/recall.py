@@ -73,9 +73,9 @@ from pycrorm_async.recall.search import (
     weights_of,
     word,
 )
-from pycrorm_async.record.declarations import built_in_declaration, declared_type
 from pycrorm_async.record.episode_writer import Emitter
 from pycrorm_async.record.event_feed import EventBuffer
+from pycrorm_async.record.plan_types import built_in_declaration, declared_type
 from pycrorm_async.record.values import pose_value
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent

@@ -1,15 +1,14 @@
 """Any executive writes episodes through this package, also our own plan layer.
 
-Both write by the same code what an episode consists of: its beginning and end, the starts and ends of its
-nodes, its percepts and tags (`EpisodeWriter`), the rows of its objects, their joints and attachments (`ObjectRows`),
-observations (`put_observation`), the values inside these (`values`), the checks of declared types (`KnownTypes`), and
-the queue (`Emitter`, `OpenEpisodes`).
+`Recording` is the way in. It declares types (`declarations`) and opens episodes. An `EpisodeWriter` writes what an
+episode consists of: its beginning and end, the starts and ends of its nodes, percepts, tags and observations.
+`ObjectRows` keeps the rows of its objects, and `values` reads live values.
 
-What comes before that differs, because the sources do. The hooks of our own plan layer (`plan_recorder`, `episode`)
-read live designators and a world that reports its changes in the plan's own thread and context, so they build
-ObjectAdded and ObjectMoved from its objects and a declaration from the annotations of a class, copy nothing twice and
-take no lock. `Recording` and `RecordedEpisode` get keys and values from any thread: they copy and convert these first,
-keep the last state of each object, because they cannot ask for it again, build a declaration from the names of fields,
-and run the calls of an episode one after the other. One function for both would make a hook pay for the copies and the
-lock.
+`RecordedEpisode` takes keys and values of any executive, from any thread: it copies and converts them first, keeps the
+last state of each object, because it cannot ask for it again, and runs the calls of all episodes one after the other.
+
+`plan_recorder`, `plan_types` and `geometry` are the adapters of our own plan layer and world: the hooks read live
+designators, and a world that reports its changes in the plan's own thread, so they copy nothing twice and take no lock.
+The other modules know neither a plan nor a world: a class of poses, objects or failures says so by an attribute
+(`__recorded_as__`, `__is_plan_failure__`).
 """

@@ -1,25 +1,30 @@
-"""Declare designator types: from a class of our own plan layer, or from names and types of fields."""
+"""Declare a designator type from the names and types of its fields.
+
+A field with a reserved name is kept under `<field>_`. One whose type contradicts a built-in type or an earlier
+declaration of the same dtype is kept under `<field>_<type>`, because one column cannot hold both; one whose name cannot
+be a column, under a similar name. A type that cannot have its name gets the most similar one that it can have.
+"""
 
 from __future__ import annotations
 
-import inspect
+import dataclasses
 import re
+import types
 import typing
-import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from datetime import datetime
 from enum import Enum
+from functools import partial
+from operator import itemgetter
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
-from msgspec.structs import replace
-
-from pycrorm_async.errors import DeclarationRefused
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.fields import (
     AcceptedFields,
     column_name,
     fault_in_declaration,
     fault_in_dtype,
-    fault_in_fields,
     fault_in_table,
     table_name,
     without_reserved_names,
@@ -30,33 +35,12 @@ from pycrorm_async.events.types import (
     FieldDeclared,
     FieldType,
     ItemType,
+    NodeKind,
     ObjectReference,
     PoseValue,
 )
-from pycrorm_async.plan.language import Designator
-from pycrorm_async.plan.task import Performable
-from pycrorm_async.record.parameters import (
-    OUR_PACKAGE,
-    DeclaredType,
-    Field,
-    FieldShape,
-    Parameter,
-    Undeclared,
-    Unresolved,
-    hint_text,
-    parameters_of,
-    shape_of,
-    undecorated_fields,
-)
-from pycrorm_async.record.values import clean, clean_repr, cut, message_of
+from pycrorm_async.record.values import Field, clean, clean_repr, cut, encoder_of, recorded_as, refuse
 from pycrorm_async.recorded_names import recorded_name
-
-#
-# Declare a designator type from the names and types of its fields, for an executive that has no class for it.
-#
-# A field with a reserved name is kept under `<field>_`, as that of a designator. One whose type contradicts a built-in
-# type or an earlier declaration of the same dtype is kept under `<field>_<type>`, because one column cannot hold both.
-# A type that cannot have its name gets the most similar one that it can have.
 
 RecordedKind: TypeAlias = Literal["action", "motion", "language"]
 FieldSpec: TypeAlias = FieldType | tuple[FieldType, ItemType] | type[Any]
@@ -67,6 +51,26 @@ _REASON_MAX = 500
 _TYPES: frozenset[str] = frozenset(get_args(FieldType))
 _WITHOUT_ITEMS = _TYPES - {"list", "dict"}
 _ITEMS: frozenset[str] = frozenset(get_args(ItemType))
+
+
+class DeclaredType(NamedTuple):
+    """The declaration of a designator type, encoded, and the fields that are read from each node.
+
+    Attributes:
+        payload: the encoded declaration; empty if the type cannot be declared.
+        fingerprint: fingerprint of the payload; empty if the type cannot be declared.
+        fields: those that are read from each node, also ones without a column, whose values are recorded as missing.
+        undeclared: the reasons of fields without a column, by their names.
+        fault: reason why the type, or one of its aliases, cannot be declared.
+    """
+
+    dtype: str
+    payload: bytes
+    fingerprint: str
+    fields: tuple[Field, ...]
+    declaration: DesignatorTypeDeclared
+    undeclared: Mapping[str, str] = MappingProxyType({})
+    fault: str | None = None
 
 
 class Renamed(NamedTuple):
@@ -81,24 +85,77 @@ class Declared(NamedTuple):
 
     type: DeclaredType
     fields: dict[str, Renamed]
-    dtype: Renamed | None
+    dtype: Renamed | None = None
 
 
-class PreparedType(NamedTuple):
-    """A type that was derived ahead, and what was known of its table then (`KnownTypes.state_of`)."""
+class OwnField(NamedTuple):
+    """A field as an executive names it, see `Field`. Without a shape no column can hold it, for this reason."""
 
-    declared: Declared
-    state: tuple[str | None, int]
-
-
-class _Named(NamedTuple):
-    """A field under a name that it may have, and the reason why it is not its own; None if it is."""
-
-    field: Field
-    reason: str | None
+    name: str
+    read: Callable[[Any], Any]
+    shape: FieldShape | None
+    reason: str = ""
+    path: tuple[str, ...] = ()
 
 
-def declare_type(
+def reason_text(text: str) -> str:
+    """Clean and shorten the reason why a field or type cannot be declared."""
+    return cut(clean(text), _REASON_MAX)
+
+
+def declare(
+    kind: NodeKind,
+    dtype: str,
+    own: Sequence[OwnField],
+    *,
+    contradiction: Callable[[FieldDeclared], str | None],
+    columns: Collection[str] = (),
+    fault: Callable[[DesignatorTypeDeclared], str | None] = fault_in_declaration,
+    **further: Any,
+) -> Declared:
+    """Declare a type with these fields.
+
+    Args:
+        contradiction: returns the reason why a field of this name and type cannot be a column; None if it can.
+        columns: names of the table's fields and columns so far, in lower case.
+        fault: returns the reason why the type cannot be declared, in which case it has no payload.
+        further: further fields of `DesignatorTypeDeclared`.
+    """
+    accepted: list[FieldDeclared] = []
+    fields: list[Field] = []
+    undeclared: dict[str, str] = {}
+    renamed: dict[str, Renamed] = {}
+    unreserved, taken = _unreserved(own), AcceptedFields()
+    for each in own:
+        field, reason = None, each.reason
+        if each.shape is not None:
+            field, reason = _named(each.name, unreserved[each.name], each.shape, contradiction, columns, taken)
+        if field is None or each.shape is None:
+            name, undeclared[name] = clean(each.name), reason_text(reason)
+            fields.append(Field(name, each.read, partial(refuse, undeclared[name]), path=each.path))
+            continue
+        taken.accept(field)
+        accepted.append(field)
+        is_object = "object" in (field.type, field.item)
+        fields.append(Field(field.name, each.read, encoder_of(field), each.shape.enum, each.path, is_object))
+        if reason:
+            renamed[clean(each.name)] = Renamed(field.name, reason_text(reason))
+    declaration = DesignatorTypeDeclared(kind=kind, dtype=dtype, fields=tuple(accepted), **further)
+    if (because := fault(declaration)) is not None:
+        return Declared(without_type(kind, dtype, because, fields), renamed)
+    payload = encode(declaration)
+    declared = DeclaredType(dtype, payload, fingerprint(payload), tuple(fields), declaration, undeclared)
+    return Declared(declared, renamed)
+
+
+def without_type(kind: NodeKind, dtype: str, fault: str, fields: Sequence[Field] = ()) -> DeclaredType:
+    """Build the record of a type that cannot be declared: its nodes keep their parameters, but have no type."""
+    dtype = reason_text(dtype)
+    placeholder = DesignatorTypeDeclared(kind=kind, dtype=dtype, table="")
+    return DeclaredType(dtype, b"", "", tuple(fields), placeholder, fault=reason_text(fault))
+
+
+def declare_named(
     kind: str,
     dtype: str,
     fields: Mapping[str, FieldSpec],
@@ -108,78 +165,49 @@ def declare_type(
     concept: str | None = None,
     aliases: Sequence[str] = (),
 ) -> Declared:
-    """Declare a type.
+    """Declare a type for an executive that has no class for it, and note it in `known_types`.
 
-    A type that cannot be declared at all has no payload, and its `fault` states why. Of a built-in dtype, table, bases
-    and concept are those of the built-in type.
+    Of a built-in dtype, table, bases and concept are those of the built-in type.
     """
-    own = cut(clean(str(dtype)), _REASON_MAX)
-    dtype, table, fault = _dtype(own, kind, known_types)
-    renamed = Renamed(dtype, fault) if fault is not None and dtype != own else None
+    own = reason_text(str(dtype))
+    dtype, table, reason = _dtype(own, kind, known_types)
     built_in = known_types.built_in(dtype)
     if built_in is not None:
         known_types.note_stored(built_in)
-    accepted: list[Field] = []
-    columns = AcceptedFields()
-    undeclared: list[Undeclared] = []
-    renamed_fields: dict[str, Renamed] = {}
-    unreserved = _unreserved(fields)
-    for name, spec in fields.items():
-        named = _named(str(name), unreserved.get(str(name), str(name)), spec, known_types, table, columns)
-        if isinstance(named, str):
-            undeclared.append(Undeclared(clean(str(name)), (name,), cut(clean(named), _REASON_MAX)))
-            continue
-        accepted.append(named.field)
-        columns.accept(named.field.declared)
-        if named.reason is not None:
-            renamed_fields[clean(str(name))] = Renamed(named.field.declared.name, clean(named.reason))
-    declaration = DesignatorTypeDeclared(
-        kind=kind,  # type: ignore[arg-type]  # checked below
-        dtype=dtype,
+        bases, concept = tuple(bases) or built_in.bases, concept or built_in.concept
+
+    def fault(declaration: DesignatorTypeDeclared) -> str | None:
+        if (reason := fault_in_declaration(declaration)) is not None:
+            return reason
+        if built_in is not None and built_in.kind != kind:
+            return f"the built-in type {dtype} is a {built_in.kind}, not a {kind}"
+        return _fault_in_aliases(declaration, known_types)
+
+    own_fields = [
+        OwnField(str(name), itemgetter(name), shape := _shape(spec), "" if shape else _no_type(spec), (name,))
+        for name, spec in fields.items()
+    ]
+    declared = declare(
+        kind,  # type: ignore[arg-type]  # checked by `fault`
+        dtype,
+        own_fields,
+        contradiction=lambda field: known_types.fault_in_field(field, table),
+        columns=known_types.columns_of(table),
+        fault=fault,
         table=table,
-        concept=cut(clean(concept), _REASON_MAX) if concept else (built_in.concept if built_in is not None else None),
-        bases=tuple(bases) or (built_in.bases if built_in is not None else ()),
-        fields=tuple(each.declared for each in accepted),
+        concept=reason_text(concept) if concept else None,
+        bases=tuple(bases),
         aliases=tuple(aliases),
     )
-    fault = (
-        fault_in_declaration(declaration)
-        or _fault_in_kind(declaration, built_in)
-        or _fault_in_aliases(declaration, known_types)
-    )
-    if fault is not None:
-        placeholder = DesignatorTypeDeclared(kind="action", dtype=own, table="")
-        reason = cut(clean(fault), _REASON_MAX)
-        undeclared_type = DeclaredType(own, b"", "", tuple(accepted), placeholder, tuple(undeclared), reason)
-        return Declared(undeclared_type, renamed_fields, None)
-    payload = encode(declaration)
-    known_types.note(declaration)
-    declared = DeclaredType(dtype, payload, fingerprint(payload), tuple(accepted), declaration, tuple(undeclared))
-    return Declared(declared, renamed_fields, renamed)
+    if not declared.type.payload:
+        kept, because = declared.type.fields, declared.type.fault or ""
+        return declared._replace(type=without_type("action", own, because, kept))
+    known_types.note(declared.type.declaration)
+    return declared._replace(dtype=Renamed(dtype, reason)) if reason is not None and dtype != own else declared
 
 
-def prepare_type(
-    kind: str, dtype: str, fields: Mapping[str, FieldSpec], known_types: KnownTypes, *, bases: Sequence[str] = ()
-) -> PreparedType | None:
-    """Derive a type ahead, without noting it; None for one whose names depend on other tables than its own."""
-    built_in = known_types.built_in(dtype)
-    table = built_in.table if built_in is not None else table_name(dtype)
-    declared = declare_type(kind, dtype, fields, known_types.copy_of(table), bases=bases)
-    if declared.dtype is not None or not declared.type.payload:
-        return None
-    return PreparedType(declared, known_types.state_of(table))
-
-
-def declare_prepared(prepared: PreparedType, known_types: KnownTypes) -> Declared | None:
-    """Declare a prepared type; None if its table has got an owner or columns since it was prepared."""
-    declaration = prepared.declared.type.declaration
-    if known_types.state_of(declaration.table) != prepared.state:
-        return None
-    built_in = known_types.built_in(declaration.dtype)
-    if built_in is not None:
-        known_types.note_stored(built_in)
-    known_types.note(declaration)
-    return prepared.declared
+def _no_type(spec: object) -> str:
+    return f"{clean_repr(spec)} is not a type of a field ({', '.join(sorted(_TYPES))}) and not a Python type of one"
 
 
 def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str, str | None]:
@@ -190,13 +218,12 @@ def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str, str 
     tables: list[str] = []
     first_fault: str | None = None
     for candidate in _dtype_candidates(own, kind):
-        built_in = known_types.built_in(candidate)
-        table = built_in.table if built_in is not None else table_name(candidate)
+        table = known_types.table_of(candidate)
         tables.append(table)
         fault = fault_in_dtype(candidate) or fault_in_table(table) or known_types.fault_in_table(table, candidate)
         if fault is None:
             return candidate, table, first_fault
-        first_fault = first_fault or cut(clean(fault), _REASON_MAX)
+        first_fault = first_fault or reason_text(fault)
     return own, tables[0], first_fault
 
 
@@ -209,12 +236,6 @@ def _dtype_candidates(own: str, kind: str) -> Iterator[str]:
     yield f"{plain}{kind.title()}"
 
 
-def _fault_in_kind(declaration: DesignatorTypeDeclared, built_in: DesignatorTypeDeclared | None) -> str | None:
-    if built_in is None or built_in.kind == declaration.kind:
-        return None
-    return f"the built-in type {built_in.dtype} is a {built_in.kind}, not a {declaration.kind}"
-
-
 def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTypes) -> str | None:
     """Return the reason why the table of a former dtype cannot be this one's; None if it can."""
     for alias in declaration.aliases:
@@ -225,36 +246,38 @@ def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTyp
     return None
 
 
-def _unreserved(fields: Mapping[str, FieldSpec]) -> dict[str, str]:
-    """Return the names that fields of a designator would have, by their own names."""
-    shapes = {str(name): shape.kind for name, spec in fields.items() if (shape := _shape(spec)) is not None}
-    own = [FieldDeclared(name, column_name(name, kind), kind, SLOT_FIRST_FIELD) for name, kind in shapes.items()]
-    return {name: each.name for name, each in zip(shapes, without_reserved_names(own), strict=True)}
+def _unreserved(own: Sequence[OwnField]) -> dict[str, str]:
+    """Return the names of fields with as many underscores as make them ones that no other field has."""
+    kinds = {each.name: each.shape.kind for each in own if each.shape is not None}
+    fields = [FieldDeclared(name, column_name(name, kind), kind, SLOT_FIRST_FIELD) for name, kind in kinds.items()]
+    return {name: each.name for name, each in zip(kinds, without_reserved_names(fields), strict=True)}
 
 
 def _named(
-    name: str, unreserved: str, spec: FieldSpec, known_types: KnownTypes, table: str, accepted: AcceptedFields
-) -> _Named | str:
-    """Return the field under the first name that it may have; the reason if it may have none."""
-    shape = _shape(spec)
-    if shape is None:
-        return f"{clean_repr(spec)} is not a type of a field ({', '.join(sorted(_TYPES))}) and not a Python type of one"
-    first_reason: str | None = None
-    for candidate in _candidates(name, unreserved, shape, known_types.columns_of(table)):
-        declared = FieldDeclared(
+    name: str,
+    unreserved: str,
+    shape: FieldShape,
+    contradiction: Callable[[FieldDeclared], str | None],
+    columns: Collection[str],
+    taken: AcceptedFields,
+) -> tuple[FieldDeclared | None, str]:
+    """Return the field under the first name that it may have, with the reason why it is not its own; or no field."""
+    first_reason = ""
+    for candidate in _candidates(name, unreserved, shape, columns):
+        field = FieldDeclared(
             name=candidate,
             column=column_name(candidate, shape.kind),
             type=shape.kind,
-            slot=SLOT_FIRST_FIELD + accepted.count,
-            optional=True,
+            slot=SLOT_FIRST_FIELD + taken.count,
+            optional=shape.optional,
             enum=recorded_name(shape.enum) if shape.enum is not None else None,
             item=shape.item,
         )
-        reason = _fault_in_field(declared, accepted) or known_types.fault_in_field(declared, table)
+        reason = _fault_in_field(field, taken) or contradiction(field)
         if reason is None:
-            return _Named(Field(declared, (name,), shape.enum), first_reason if candidate != unreserved else None)
+            return field, first_reason if candidate != unreserved else ""
         first_reason = first_reason or reason
-    return first_reason or "it has no name"
+    return None, first_reason
 
 
 def _candidates(name: str, unreserved: str, shape: FieldShape, columns: Collection[str]) -> Iterator[str]:
@@ -269,22 +292,105 @@ def _candidates(name: str, unreserved: str, shape: FieldShape, columns: Collecti
     yield f"{plain}_{shape.kind}"
 
 
-def _fault_in_field(field: FieldDeclared, accepted: AcceptedFields) -> str | None:
+def _fault_in_field(field: FieldDeclared, taken: AcceptedFields) -> str | None:
     if not field.name.isidentifier() or field.name.startswith("_"):
         return f"{cut(field.name, 100)!r} is not a valid field name"
-    return accepted.fault_in(field)
+    return taken.fault_in(field)
+
+
+# === types of fields ==========================================================================================
+#
+# Map field types as an executive names them, and Python types, to types of fields.
 
 
 def _shape(spec: object) -> FieldShape | None:
-    """Return the field type of a spec; None if there is none."""
+    """Return the field type of a spec, which may be left out; None if there is none."""
     if isinstance(spec, str):
-        return FieldShape(spec) if spec in _WITHOUT_ITEMS else None  # type: ignore[arg-type]  # just checked
+        return FieldShape(spec, optional=True) if spec in _WITHOUT_ITEMS else None  # type: ignore[arg-type]  # checked
     if isinstance(spec, tuple) and len(spec) == 2 and spec[0] in ("list", "dict") and spec[1] in _ITEMS:
-        return FieldShape(spec[0], item=spec[1])
+        return FieldShape(spec[0], optional=True, item=spec[1])
     if isinstance(spec, type) and not isinstance(spec, Enum) and issubclass(spec, PoseValue | ObjectReference):
-        return FieldShape("pose" if issubclass(spec, PoseValue) else "object")
+        return FieldShape("pose" if issubclass(spec, PoseValue) else "object", optional=True)
     shape = shape_of(spec)
-    return shape if shape is not None and shape.nested is None else None
+    return shape._replace(optional=True) if shape is not None and shape.nested is None else None
+
+
+class FieldShape(NamedTuple):
+    """The field type of a parameter; `nested` is a dataclass, whose fields replace the parameter."""
+
+    kind: FieldType
+    optional: bool = False
+    item: ItemType | None = None
+    enum: type[Enum] | None = None
+    nested: type | None = None
+
+
+def shape_of(hint: Any) -> FieldShape | None:
+    """Map a type hint to a field type; None if no column can hold it."""
+    origin = typing.get_origin(hint)
+    if isinstance(hint, typing.NewType):
+        return shape_of(hint.__supertype__)
+    if origin in (typing.Union, types.UnionType):
+        return _union_shape(hint)
+    if origin is typing.Literal:
+        return FieldShape("text") if all(isinstance(each, str) for each in typing.get_args(hint)) else None
+    if origin is not None and isinstance(origin, type):
+        return _container_shape(origin, typing.get_args(hint))
+    if isinstance(hint, type):
+        return _class_shape(hint)
+    return None
+
+
+def _class_shape(kind: type) -> FieldShape | None:
+    if issubclass(kind, Enum):
+        return FieldShape("enum", enum=kind)
+    for python, name in _SCALARS:
+        if issubclass(kind, python):
+            return FieldShape(name)
+    if (recorded := recorded_as(kind)) is not None:
+        return FieldShape("pose" if recorded == "pose" else "object")
+    if dataclasses.is_dataclass(kind):
+        return FieldShape("text", nested=kind)
+    return None
+
+
+_SCALARS: tuple[tuple[type, FieldType], ...] = (
+    (bool, "boolean"),
+    (int, "integer"),
+    (float, "real"),
+    (str, "text"),
+    (datetime, "datetime"),
+)
+
+
+def _union_shape(hint: Any) -> FieldShape | None:
+    members = [each for each in typing.get_args(hint) if each is not type(None)]
+    optional = len(members) < len(typing.get_args(hint))
+    shapes = {shape._replace(optional=False) if shape else None for shape in map(shape_of, members)}
+    optional = optional or any(shape is not None and shape.optional for shape in map(shape_of, members))
+    if shapes == {FieldShape("integer"), FieldShape("real")}:
+        shapes = {FieldShape("real")}
+    if len(shapes) != 1:
+        return None
+    shape = shapes.pop()
+    return shape._replace(optional=optional) if shape is not None else None
+
+
+def _container_shape(origin: type, arguments: tuple[Any, ...]) -> FieldShape | None:
+    kind: FieldType
+    if issubclass(origin, Mapping) and len(arguments) == 2:
+        key = shape_of(arguments[0])
+        if key is None or key.kind not in ("text", "enum") or key.optional:
+            return None
+        kind, value = "dict", arguments[1]
+    elif issubclass(origin, Sequence) and len({each for each in arguments if each is not Ellipsis}) == 1:
+        kind, value = "list", arguments[0]
+    else:
+        return None
+    item = shape_of(value)
+    if item is None or item.nested is not None or item.kind in ("list", "dict"):
+        return None
+    return FieldShape(kind, item=typing.cast("ItemType", item.kind), enum=item.enum)
 
 
 # === known types ==============================================================================================
@@ -346,6 +452,11 @@ class KnownTypes:
         """Return the owner of a table and the number of its names; they change with each declaration that adds any."""
         return self._tables.get(table.lower()), len(self._columns.get(table.lower(), ()))
 
+    def table_of(self, dtype: str) -> str:
+        """Return the table that the nodes of a dtype are in."""
+        built_in = self.built_in(dtype)
+        return built_in.table if built_in is not None else table_name(dtype)
+
     def copy_of(self, table: str) -> KnownTypes:
         """Return a copy that knows this table alone."""
         copy, name = KnownTypes(self.built_in), table.lower()
@@ -372,307 +483,3 @@ class KnownTypes:
 def type_text(field: FieldDeclared) -> str:
     """Describe a field's type; an enum counts as text, because its members are stored as text."""
     return f"{'text' if field.type == 'enum' else field.type}{f' of {field.item}' if field.item else ''}"
-
-
-# === declaration ==============================================================================================
-#
-# Derive the declaration of a designator class: its fields with their types, slots and columns.
-#
-# Each parameter of the class (see `record.parameters`) becomes a field. A parameter that cannot be a column is omitted
-# from the declaration, and its values are recorded as missing. If the whole class cannot be declared, its nodes are
-# recorded without a type. In strict mode both cases raise `DeclarationRefused` the first time the class is performed.
-
-_NESTED_MAX = 8
-"""Bounds the nesting of dataclasses in a parameter, so that a dataclass that contains itself ends."""
-_DTYPE_IN_USE = "already has the dtype or table {!r} (set a class attribute `dtype` on one of the two)"
-_ALIAS_IN_USE = "already has the alias {!r} (only one class can have it)"
-
-
-class Declarations:
-    """Holds the declarations of all designator classes that one memory has recorded.
-
-    Only one of two live classes with the same dtype is declared. `known` holds their fields for all executives.
-
-    Args:
-        strict: raise `DeclarationRefused` for a class or field that cannot be declared, instead of omitting it.
-    """
-
-    def __init__(self, *, strict: bool = True) -> None:
-        self._strict = strict
-        self.known = KnownTypes(built_in_declaration)
-        self._declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
-        self._classes_by_name: dict[str, weakref.ref[type]] = {}
-        self._classes_by_alias: dict[str, weakref.ref[type]] = {}
-
-    def of(self, designator: type[Performable], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
-        """Return the declaration of a class; before returning it for the first time, call `on_new` with it."""
-        cached = self._declared.get(designator)
-        if cached is not None:
-            return cached
-        declared = self._new(designator)
-        if declared.fingerprint:
-            on_new(declared)
-            declaration = declared.declaration
-            self._classes_by_name |= dict.fromkeys((declaration.dtype, declaration.table), weakref.ref(designator))
-            self._classes_by_alias |= dict.fromkeys(declaration.aliases, weakref.ref(designator))
-            self.known.note(declaration)
-        self._declared[designator] = declared
-        return declared
-
-    def _new(self, designator: type[Performable]) -> DeclaredType:
-        try:
-            declared = declared_type(
-                designator,
-                strict=self._strict,
-                field_types=self.known.fields_of(designator.__dtype__),
-                classes_by_alias=self._classes_by_alias,
-            )
-            fault = declared.fault or self._fault_in_names(designator, declared)
-        except DeclarationRefused:
-            raise
-        except Exception as error:
-            if self._strict:
-                raise
-            reason = f"its fields cannot be read: {type(error).__name__}: {message_of(error)}"
-            return _without_type(designator, (), (), cut(clean(reason), _REASON_MAX))
-        if fault is None or not declared.fingerprint:
-            return declared
-        if self._strict:
-            raise DeclarationRefused(_path(designator), fault)
-        return _without_type(designator, declared.fields, declared.undeclared, fault)
-
-    def _fault_in_names(self, designator: type[Performable], declared: DeclaredType) -> str | None:
-        """Return the reason why another live class already has the dtype or table name; None if none has."""
-        if not designator.__module__.startswith(OUR_PACKAGE):
-            for other in _built_in_classes(designator.__dtype__):
-                return f"{_path(other)} already has the dtype {other.__dtype__!r} (set a class attribute `dtype`)"
-        names = (declared.declaration.dtype, declared.declaration.table)
-        return _conflict(designator, self._classes_by_name, names, _DTYPE_IN_USE)
-
-
-def _conflict(
-    designator: type, classes_by_name: Mapping[str, weakref.ref[type]], names: Sequence[str], reason: str
-) -> str | None:
-    for name in names:
-        reference = classes_by_name.get(name)
-        other = reference() if reference is not None else None
-        if other is not None and _path(other) != _path(designator):
-            return f"{_path(other)} {reason.format(name)}"
-    return None
-
-
-_built_in_declarations: dict[str, DesignatorTypeDeclared] = {}
-"""Cache of derived declarations, by dtype; deriving one takes a millisecond."""
-
-
-def built_in_declaration(dtype: str) -> DesignatorTypeDeclared | None:
-    """Return the declaration of the plan layer's own type with this dtype; None if it has none."""
-    if dtype not in _built_in_declarations:
-        for designator in _built_in_classes(dtype):
-            if not inspect.isabstract(designator):
-                _built_in_declarations[dtype] = declared_type(designator, strict=False).declaration
-    return _built_in_declarations.get(dtype)
-
-
-def _descendants(root: type) -> typing.Iterator[Any]:
-    each: Any
-    for each in root.__subclasses__():
-        yield each
-        yield from _descendants(each)
-
-
-def declared_type(
-    designator: type[Performable],
-    *,
-    strict: bool = True,
-    field_types: Mapping[str, str] | None = None,
-    classes_by_alias: Mapping[str, weakref.ref[type]] | None = None,
-) -> DeclaredType:
-    """Derive the declaration of one class.
-
-    Args:
-        designator: the class.
-        strict: raise `DeclarationRefused`, naming class and field, for a field or class that cannot be declared.
-        field_types: field types of earlier classes with the same dtype; a field must not change its type.
-        classes_by_alias: classes by the aliases they have; an alias belongs to one class.
-    """
-    undeclared: list[Undeclared] = []
-
-    def leave_out(name: str, path: tuple[str, ...], reason: str) -> None:
-        if strict:
-            raise DeclarationRefused(_path(designator), f"field {name!r} {reason}")
-        undeclared.append(Undeclared(name, path, cut(clean(reason), _REASON_MAX)))
-
-    undecorated = undecorated_fields(designator)
-    if strict and undecorated and not designator.__module__.startswith(OUR_PACKAGE):
-        raise DeclarationRefused(
-            _path(designator), f"it has the field {undecorated[0]!r} but is not a dataclass (add @dataclass)"
-        )
-    fields = tuple(
-        _declarable_fields(
-            designator, list(_fields(designator, leave_out)), field_types or {}, undeclared, strict=strict
-        )
-    )
-    table = getattr(designator.__orm_class__, "__tablename__", None) or table_name(designator.__dtype__)
-    fault = fault_in_dtype(designator.__dtype__) or fault_in_table(table)
-    if fault is not None:
-        if strict:
-            raise DeclarationRefused(_path(designator), fault)
-        return _without_type(designator, fields, tuple(undeclared), fault)
-    aliases, fault = _aliases_or_fault(designator, classes_by_alias or {})
-    if strict and fault is not None:
-        raise DeclarationRefused(_path(designator), fault)
-    declaration = DesignatorTypeDeclared(
-        kind=designator.__kind__,
-        dtype=designator.__dtype__,
-        table=table,
-        concept=designator.__concept__,
-        bases=_bases(designator),
-        fields=tuple(field.declared for field in fields),
-        aliases=aliases,
-    )
-    if (reason := fault_in_declaration(declaration)) is not None:
-        if strict:
-            raise DeclarationRefused(_path(designator), reason)
-        return _without_type(designator, fields, tuple(undeclared), reason)
-    payload = encode(declaration)
-    return DeclaredType(declaration.dtype, payload, fingerprint(payload), fields, declaration, tuple(undeclared), fault)
-
-
-def _without_type(
-    designator: type[Performable], fields: tuple[Field, ...], undeclared: tuple[Undeclared, ...], fault: str
-) -> DeclaredType:
-    """Build the record of a class that cannot be declared: its nodes keep their parameters, but have no type."""
-    dtype = cut(clean(designator.__dtype__), _REASON_MAX)
-    placeholder = DesignatorTypeDeclared(kind=designator.__kind__, dtype=dtype, table="")
-    return DeclaredType(dtype, b"", "", fields, placeholder, undeclared, fault)
-
-
-def _declarable_fields(
-    designator: type, fields: list[Field], field_types: Mapping[str, str], undeclared: list[Undeclared], *, strict: bool
-) -> typing.Iterator[Field]:
-    """Yield the fields that can be columns of one table, each with its own slot; add the others to `undeclared`."""
-    accepted: list[FieldDeclared] = []
-    renamed = without_reserved_names(field.declared for field in fields)
-    fields = [field._replace(declared=declared) for field, declared in zip(fields, renamed, strict=True)]
-    combined_fault = fault_in_fields([field.declared for field in fields])
-    if strict and combined_fault is not None:
-        raise DeclarationRefused(_path(designator), combined_fault)
-    for field in fields:
-        name, kind = field.declared.name, type_text(field.declared)
-        fault = fault_in_fields([*accepted, field.declared]) if combined_fault is not None else None
-        if field_types.get(name, kind) != kind:
-            fault = f"field {name!r} was {field_types[name]} before and is {kind} now (rename it, or set another dtype)"
-        if fault is None:
-            accepted.append(replace(field.declared, slot=SLOT_FIRST_FIELD + len(accepted)))
-            yield field._replace(declared=accepted[-1])
-        elif strict:
-            raise DeclarationRefused(_path(designator), fault)
-        else:
-            undeclared.append(Undeclared(name, field.path, fault))
-
-
-def _bases(designator: type[Performable]) -> tuple[str, ...]:
-    """Return the dtypes of the base classes, nearest first, without the abstract roots of the plan layer."""
-    return tuple(
-        base.__dtype__
-        for base in designator.__mro__[1:]
-        if issubclass(base, Designator) and not getattr(base, "__abstractmethods__", None)
-    )
-
-
-def _aliases_or_fault(
-    designator: type[Performable], classes_by_alias: Mapping[str, weakref.ref[type]]
-) -> tuple[tuple[str, ...], str | None]:
-    """Return the aliases of a class; if one of them is not allowed, return no aliases and the reason."""
-    try:
-        aliases = _aliases(designator)
-    except DeclarationRefused as refused:
-        return (), refused.reason
-    fault = _conflict(designator, classes_by_alias, aliases, _ALIAS_IN_USE)
-    return (aliases, None) if fault is None else ((), fault)
-
-
-def _aliases(designator: type[Performable]) -> tuple[str, ...]:
-    """Read the former names of this type; a subclass does not inherit them."""
-    aliases = designator.__aliases__
-    if not isinstance(aliases, tuple | list) or not all(isinstance(each, str) for each in aliases):
-        raise DeclarationRefused(
-            _path(designator), f"its aliases {aliases!r} are not a tuple of names such as ('OldAction',)"
-        )
-    for each in aliases:
-        fault = _fault_in_alias(each, designator)
-        if fault is not None:
-            raise DeclarationRefused(_path(designator), f"its alias {each!r} {fault}")
-    return tuple(aliases)
-
-
-def _fault_in_alias(alias: str, designator: type[Performable]) -> str | None:
-    if fault_in_dtype(alias) is not None:
-        return "is not a name (letters, digits and single underscores)"
-    if alias == designator.__dtype__:
-        return "is its current dtype"
-    if alias in _bases(designator):
-        return "is the dtype of one of its base classes, which is another type"
-    for other in _built_in_classes(alias):
-        return f"is the dtype of {_path(other)}"
-    return None
-
-
-def _built_in_classes(dtype: str) -> typing.Iterator[type[Designator]]:
-    for other in _descendants(Designator):
-        if other.__module__.startswith(OUR_PACKAGE) and getattr(other, "__dtype__", None) == dtype:
-            yield other
-
-
-def _fields(designator: type, leave_out: Callable[[str, tuple[str, ...], str], None]) -> typing.Iterator[Field]:
-    for name, path, shape in _flattened_parameters(designator, (), (), leave_out, optional=False):
-        yield Field(
-            FieldDeclared(
-                name=name,
-                column=column_name(name, shape.kind),
-                type=shape.kind,
-                slot=SLOT_FIRST_FIELD,
-                optional=shape.optional,
-                enum=recorded_name(shape.enum) if shape.enum is not None else None,
-                item=shape.item,
-            ),
-            path,
-            shape.enum,
-        )
-
-
-def _flattened_parameters(
-    owner: type,
-    outer: tuple[str, ...],
-    prefix: tuple[str, ...],
-    leave_out: Callable[[str, tuple[str, ...], str], None],
-    *,
-    optional: bool,
-) -> typing.Iterator[tuple[str, tuple[str, ...], FieldShape]]:
-    for each in parameters_of(owner):
-        names, path = (*outer, each.name), (*prefix, *each.path)
-        name = "_".join(names)
-        shape = None if isinstance(each.hint, Unresolved) else shape_of(each.hint)
-        if shape is None:
-            leave_out(name, path, _without_column(each))
-        elif shape.nested is None:
-            yield name, path, shape._replace(optional=optional or shape.optional)
-        elif len(names) > _NESTED_MAX:
-            leave_out(name, path, f"is nested more than {_NESTED_MAX} deep")
-        else:
-            inner_optional = optional or shape.optional
-            yield from _flattened_parameters(shape.nested, names, path, leave_out, optional=inner_optional)
-
-
-def _without_column(parameter: Parameter) -> str:
-    if isinstance(parameter.hint, Unresolved):
-        return parameter.hint.reason
-    return (
-        f"has the type {hint_text(parameter.hint)}, which has no column: use int, float, str, bool, an Enum, an aware"
-        " datetime, a Pose, an object designator, a dataclass of these, or a list or dict of these"
-    )
-
-
-def _path(kind: type) -> str:
-    return f"{kind.__module__}.{kind.__qualname__}"

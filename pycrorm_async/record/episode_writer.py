@@ -1,12 +1,11 @@
 """An `EpisodeWriter` writes the events of one open episode.
 
-Theory of operation. The writer does not know the executive: `N` is an executive's own record of a node. `_open_nodes`
-holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
-two; if it raises before the end is written, it restores the node, which then ends with the episode. Ctrl-C can
-come at any call, also after the event is written: a `Receipt` shows that, and the lines that update the state by it
-make no call. `_ending` holds a node while a thread writes its end. The ends of episodes wait, for a limited time, until
-it is empty, because the end of a node must precede the end of its episode. The end of a node never waits, because the
-garbage collector may cause it.
+Theory of operation. The writer does not know the executive: it names nodes by the sequences of their starts, and
+objects by whatever the executive uses. `_open` holds every node that started and whose end is not written, with the
+name of its type. The call that removes a node writes its end, so no node has two. Ctrl-C can come at any call: a node
+whose start or end it interrupted may have no end, and ends with its episode. `_ending` holds a node while a thread
+writes its end. The ends of episodes wait, for a limited time, until it is empty, because the end of a node must precede
+the end of its episode. The end of a node never waits, because the garbage collector may cause it.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ import os
 import platform
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
+import msgspec
 from msgspec.structs import replace
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.errors import CallerError, EpisodeFull, FilesError, SpoolFull, SpoolStuck, Unrecordable
-from pycrorm_async.events.codec import Heading, NotEncodable, Receipt, encode, encoded_bytes
+from pycrorm_async.events.codec import Heading, NotEncodable, encode, encoded_bytes
 from pycrorm_async.events.fields import changed_tags, checked_tags
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.types import (
@@ -41,56 +40,44 @@ from pycrorm_async.events.types import (
     EpisodeTagged,
     FailureValue,
     Happening,
+    MissingValue,
     NodeEnded,
     NodeKind,
     NodeReference,
     NodeStarted,
     NodeStatus,
-    ObjectDetected,
     ObjectReference,
     Observed,
     RobotValue,
 )
-from pycrorm_async.plan.failures import is_plan_failure
+from pycrorm_async.record.declarations import Declared, DeclaredType
 from pycrorm_async.record.event_feed import EventFeed
 from pycrorm_async.record.geometry import Descriptions
-from pycrorm_async.record.parameters import (
-    EPISODE_TEXT_MAX,
-    ROBOT,
-    DeclaredType,
-    fit_detection,
-    fit_episode_end,
-    fit_episode_start,
-    fit_node_end,
-    fit_node_start,
-)
 from pycrorm_async.record.values import (
     NO_REFERENCES,
     MissingValues,
-    ObservedReader,
+    ValueReader,
     clean,
     clean_repr,
     cut,
     failure_value,
     message_of,
     missing_in,
+    missing_value,
 )
 from pycrorm_async.settings import Settings
-from pycrorm_async.world.bullet import Object
 
 _LAST_ENDS_S = 1.0
 """Bounds the wait of an episode's end for ends of nodes in other threads; each takes microseconds."""
 _DESCRIPTION_MAX = 200
 """Bounds the characters of the description in a notebook."""
 
-N = TypeVar("N")
 
-
-class EpisodeWriter(ABC, Generic[N]):
-    """An open or closed episode.
+class EpisodeWriter:
+    """An open or closed episode, of an executive that reports from one thread at a time.
 
     Attributes:
-        emitter: puts the events into the queue and counts faults.
+        emitter: has the queue, and counts faults.
         id: 16 bytes of a UUIDv7; `str(episode)` is its text.
         closed: whether the last event has been written, or its writing has begun.
         simulated: whether the episode is a simulation.
@@ -102,12 +89,12 @@ class EpisodeWriter(ABC, Generic[N]):
         self.simulated: Final = opening.simulated
         self.emitter = emitter
         self._opening = opening
-        self._open_nodes: dict[int, N] = {}
-        self._ending: set[N] = set()
+        self._headings: dict[type[Happening], Heading] = {}
+        self._open: dict[int, str] = {}
+        self._ending: set[int] = set()
         self._is_begun = False
+        self._is_ended = False
         self._root = 0
-        self._root_ended = False
-        self._end_interrupted = False
 
     def __str__(self) -> str:
         return episode_text(self.id)
@@ -128,179 +115,145 @@ class EpisodeWriter(ABC, Generic[N]):
             "where episode is this object</div></div>"
         )
 
-    # --- what an executive adds -------------------------------------------------------------------------------
+    def reference(self, _key: Any, /) -> ObjectReference | None:
+        """Return an object's current row; None, because an episode without a world has no objects."""
+        return None
 
-    @abstractmethod
-    def reference(self, world_object: Object) -> ObjectReference | None:
-        """Return the object's current row in this episode; None without a row."""
+    def node_or_root(self, _node: Any, /) -> int:
+        """Return the sequence of this node or of its nearest recorded ancestor; else that of the root."""
+        return self._root
 
-    @abstractmethod
-    def node_or_root(self, node: Any) -> int:
-        """Return the sequence of this node or of its nearest recorded ancestor; None gives the root."""
+    # --- events -----------------------------------------------------------------------------------------------
 
-    @abstractmethod
-    def _leave_world(self) -> None:
-        """Write no more changes of the world."""
+    def put(self, event: Happening, owner: str = "", *, may_refuse: bool = False, reserved: bool = True) -> int:
+        """Append an event and return its sequence. Parts that cannot be recorded are left out, and counted.
 
-    @abstractmethod
-    def _described_world(self) -> str | None:
-        """Return the description of the world that was entered inside the episode; None if none was."""
-
-    # --- the episode ------------------------------------------------------------------------------------------
+        Args:
+            owner: the type whose values are counted as missing; by default that of the event.
+            may_refuse: raise `Unrecordable` for a missing parameter, if the settings ask for it.
+            reserved: use the spool's reserve, and block when that is used up; otherwise raise `SpoolFull`.
+        """
+        emitter, kind = self.emitter, type(event)
+        try:
+            payload = encode(event, bytes_max=emitter.record_bytes_max)
+        except NotEncodable:
+            event, reasons = fitted(event, emitter.record_bytes_max)
+            emitter.note_missing(owner or kind.__name__, reasons, may_refuse=may_refuse)
+            payload = encode(event, bytes_max=emitter.record_bytes_max)
+        heading = self._headings.get(kind)
+        if heading is None:
+            heading = self._headings[kind] = Heading(self.id, kind.__name__, kind.version)
+        try:
+            sequence = emitter.sink.put_nowait(heading, payload, reserved=reserved)
+        except SpoolFull:
+            if not reserved:
+                raise
+            sequence = emitter.put_payload(heading, payload)
+        if emitter.feed.observers:
+            emitter.feed.publish(self.id, sequence, event)
+        return sequence
 
     def open(self) -> None:
         """Write the start of the episode and of its root node."""
-        started = episode_started(self._opening)
-        started, shortened = fit_episode_start(started, self.emitter.settings.record_bytes_max)
-        for name in shortened:
-            self.emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
-        begun, root_started = Receipt(), Receipt()
+        self._is_begun = True  # also if Ctrl-C comes before the next line returns
         try:
-            self.emitter.put(self.id, started, begun)
-            self.emitter.put(self.id, NodeStarted("root", simulated=self.simulated), root_started)
-        finally:
-            self._is_begun = begun.sequence > 0
-            self._root = root_started.sequence
+            self.put(self._started(), "Episode")
+        except Exception:
+            self._is_begun = False
+            raise
+        self._root = self.put(NodeStarted("root", simulated=self.simulated))
+        self._open[self._root] = "Episode"
+
+    def _started(self) -> Happening:
+        """Return the first event, with texts that its columns can show."""
+        started: Happening = episode_started(self._opening)
+        reasons: dict[str, str] = {}
+        if not fits(started, self.emitter.record_bytes_max):
+            started, reasons = fitted(started, self.emitter.record_bytes_max)
+        for name in ("description", "plan", "world"):
+            text = getattr(started, name)
+            if text is not None and len(text) > EPISODE_TEXT_MAX:
+                started = replace(started, **{name: cut(text, EPISODE_TEXT_MAX)})
+                reasons[name] = "its text is too long for an episode and was cut"
+        self.emitter.note_missing("Episode", reasons)
+        return started
 
     def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
         tags = changed_tags(self._opening.labels.tags, added, removed)
-        self.emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))
+        self.put(EpisodeTagged(tuple(added), tuple(removed)))
         self._opening = self._opening.with_tags(tags)
 
-    def end_episode(self, failure: BaseException | None) -> None:
-        """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.
-
-        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written.
-
-        After a call that raised before the last event was written, the next call writes what is missing.
-        """
-        if self.closed and not self._end_interrupted:
-            return
-        receipt = Receipt()
-        self.closed, self._end_interrupted = True, False
-        try:
-            self._put_last_events(failure, receipt)
-        except BaseException:
-            self._end_interrupted = not receipt.sequence
-            raise
-
-    def _put_last_events(self, failure: BaseException | None, receipt: Receipt) -> None:
-        if not self._is_begun:
-            return
-        self._leave_world()
-        status, root_status = self._end_statuses(failure)
-        node_status = root_status if status == "INTERRUPTED" else "LOST"
-        for sequence in sorted(self._open_nodes, reverse=True):
-            self._close_node(NodeEnded(sequence, node_status), "Episode")
-        self._wait_for_ends()
-        value = failure_value(failure, self) if failure is not None else None
-        self._end_root(root_status, value)
-        ended = EpisodeEnded(status, value, world=self._described_world())
-        try:
-            self.emitter.put(self.id, ended, receipt)
-        except NotEncodable:
-            self.emitter.put(self.id, fit_episode_end(ended, self.emitter.settings.record_bytes_max), receipt)
-
-    def _end_root(self, status: NodeStatus, failure: FailureValue | None) -> None:
-        """Write the end of the root; no effect if it is written, or if Ctrl-C came before the root started."""
-        if self._root_ended or not self._root:
-            return
-        receipt = Receipt()
-        try:
-            self._put_end(NodeEnded(self._root, status, failure), "Episode", receipt)
-        finally:
-            self._root_ended = receipt.sequence > 0
-
-    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
-        """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
-        return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
-
-    # --- nodes and perception -----------------------------------------------------------------------------------
-
-    def _put_start(
-        self, node: N, declared: DeclaredType, kind: NodeKind, parent: int, parameters: dict[str, Any],
-        robot: RobotValue | None, *, missing: Mapping[str, str], may_refuse: bool,
-    ) -> int:  # fmt: skip
+    def put_start(
+        self,
+        declared: DeclaredType,
+        kind: NodeKind,
+        parent: int,
+        parameters: dict[str, Any],
+        robot: RobotValue | None,
+        missing: Mapping[str, str],
+        *,
+        may_refuse: bool = False,
+    ) -> int:
         """Write the start of a node and return its sequence. `missing` has the reason for each missing value.
 
         Raises `Unrecordable` if `may_refuse` and the settings ask for it.
         """
         owner = declared.dtype
-        event = NodeStarted(
-            kind=kind,
-            parent=parent,
-            designator=declared.fingerprint or None,
-            parameters=parameters,
-            robot=robot,
-            simulated=self.simulated,
-        )
         if missing:
-            self._note_parameters(owner, missing, may_refuse=may_refuse)
-        receipt = Receipt()
+            self.emitter.note_missing(owner, missing, may_refuse=may_refuse)
+        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, robot, self.simulated)
+        sequence = self.put(event, owner, may_refuse=may_refuse)
+        self._open[sequence] = owner
+        return sequence
+
+    def put_end(self, node: int, status: NodeStatus, failure: FailureValue | None = None, result: Any = None) -> None:
+        """Write the end of a node; no effect if it has ended, as the garbage collector may cause meanwhile."""
+        self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
         try:
-            try:
-                self.emitter.put(self.id, event, receipt)
-            except NotEncodable:
-                unfitting: dict[str, str] = {}
-                event = fit_node_start(event, self.emitter.settings.record_bytes_max, unfitting)
-                self._note_parameters(owner, unfitting, may_refuse=may_refuse)
-                self.emitter.put(self.id, event, receipt)
+            owner = self._open.pop(node, None)
+            if owner is not None:
+                if failure is not None or result is not None:
+                    parts = {"failure": failure.arguments if failure is not None else None, "result": result}
+                    for name, value in parts.items():
+                        for each in missing_in(value):
+                            self.emitter.missing.note(owner, name, each.missing)
+                self.put(NodeEnded(node, status, failure, result), owner)
         finally:
-            if receipt.sequence:
-                self._open_nodes[receipt.sequence] = node
-        return receipt.sequence
+            self._ending.discard(node)
 
-    def _note_parameters(self, owner: str, missing: Mapping[str, str], *, may_refuse: bool) -> None:
-        parameters = [name for name in missing if name != ROBOT]
-        if may_refuse and parameters and self.emitter.settings.on_unrecordable == "refuse":
-            raise Unrecordable(owner, " and ".join(parameters), missing[parameters[0]])
-        for name, reason in missing.items():
-            self.emitter.missing.note(owner, name, reason)
+    # --- the end ----------------------------------------------------------------------------------------------
 
-    def _close_node(self, event: NodeEnded, owner: str) -> None:
-        """Remove the node and write its end; no effect if it was removed, as the garbage collector may do meanwhile."""
-        receipt = Receipt()
-        try:
-            node = self._open_nodes[event.node]
-            del self._open_nodes[event.node]  # no call since the line before, so Ctrl-C cannot separate the two
-        except KeyError:
+    def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
+        """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.
+
+        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written.
+
+        After a call that Ctrl-C interrupted, the next call writes what is missing.
+        """
+        if self._is_ended or not self._is_begun:
+            self.closed = True
             return
-        try:
-            self._put_end(event, owner, receipt)
-        except BaseException:
-            if not receipt.sequence:
-                self._open_nodes[event.node] = node  # so that it ends with the episode
-            raise
-
-    def _wait_for_ends(self) -> None:
-        """Wait until other threads have written the ends of nodes that they are ending, for a limited time."""
+        self.closed = True
+        status, root_status = self._end_statuses(failure)
+        value = failure_value(failure, self) if failure is not None else None
+        for sequence in sorted(self._open.keys() - {self._root}, reverse=True):
+            self.put_end(sequence, root_status if status == "INTERRUPTED" else "LOST")
         deadline = time.monotonic() + _LAST_ENDS_S
         while self._ending and time.monotonic() < deadline:
-            time.sleep(0.001)
+            time.sleep(0.001)  # other threads write the ends of nodes
+        self.put_end(self._root, root_status, value)
+        self.put(EpisodeEnded(status, value, world=world), "Episode")
+        self._is_ended = True
 
-    def _put_end(self, event: NodeEnded, owner: str, receipt: Receipt) -> None:
-        if event.failure is not None or event.result is not None:
-            for field, value in (("failure", event.failure and event.failure.arguments), ("result", event.result)):
-                for each in missing_in(value):
-                    self.emitter.missing.note(owner, field, each.missing)
-        try:
-            self.emitter.put(self.id, event, receipt)
-        except NotEncodable as error:
-            self.emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
-            self.emitter.put(self.id, fit_node_end(event, self.emitter.settings.record_bytes_max), receipt)
-
-    def _put_detection(self, detected: ObjectDetected) -> int:
-        try:
-            return self.emitter.put(self.id, detected)
-        except NotEncodable as error:
-            self.emitter.missing.note("ObjectDetected", "seen", error.reason)
-            return self.emitter.put(self.id, fit_detection(detected, self.emitter.settings.record_bytes_max))
+    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+        """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
+        return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
 
 
 # === emitter ==================================================================================================
 #
-# The `Emitter` puts events into the queue and counts faults of the hooks, so that they do not reach a plan.
+# The `Emitter` holds the queue and counts faults of the hooks, so that they do not reach a plan.
 
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
@@ -309,10 +262,16 @@ THREAD_NAME_PREFIX = "pycrorm "
 """The names of all threads of the memory begin with this."""
 _REASON_MAX = 2_000
 """Bounds the characters of the last fault's message in `status`."""
-_HEADINGS_MAX = 1_000
-"""Bounds the headings kept for reuse: an episode has one for each event type. When it is reached all are dropped."""
 UNAWAITED_MAX = 100
 """Bounds the designator types listed with a perform that was never awaited; the latest are kept."""
+
+
+def is_of_memory() -> bool:
+    """Return whether this is a thread of a memory. Such threads make room in the spool, so they must not wait for it.
+
+    The garbage collector may close a dropped plan, and so record, in any thread.
+    """
+    return threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
 
 
 class BlobRefused(ValueError):
@@ -327,11 +286,11 @@ class Faults(NamedTuple):
 
 
 class Emitter:
-    """Puts the events of one memory into its queue.
+    """The queue of one memory, its observers, and its counts of what was not recorded.
 
     Only the start of a node or an episode waits for room, before it is written (`must_wait`). All other events,
-    including the start of a simulation, must not wait, so `put` may use the spool's reserve. If the reserve is used up
-    as well, `put` blocks the calling thread until a record was stored. It drops no event.
+    including the start of a simulation, must not wait, so they may use the spool's reserve. If the reserve is used up
+    as well, `put_payload` blocks the calling thread until a record was stored. No event is dropped.
 
     Attributes:
         is_closed: whether the memory is closed, or belongs to the process that forked this one; hooks then only count.
@@ -345,13 +304,13 @@ class Emitter:
     def __init__(self, sink: EventSink, settings: Settings) -> None:
         self.sink = sink
         self.settings = settings
+        self.record_bytes_max: Final = settings.record_bytes_max
         self.is_closed = False
         self.unrecorded = 0
         self.feed = EventFeed()
         self.missing = MissingValues()
         self.descriptions = Descriptions(self, settings, self.missing)
         self.unawaited: tuple[str, ...] = ()
-        self._headings: dict[tuple[EpisodeId, type[Happening]], Heading] = {}
         self._fault_count = 0
         self._last_fault: str | None = None
 
@@ -359,30 +318,13 @@ class Emitter:
     def faults(self) -> Faults:
         return Faults(self._fault_count, self._last_fault)
 
-    def put(self, episode: EpisodeId, event: Happening, receipt: Receipt | None = None) -> int:
-        """Append an event and return its sequence. Raises `NotEncodable` before anything is written.
-
-        The sequence of the receipt shows after any exception whether the event was written.
-        """
-        payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        heading = self._heading(episode, type(event))
-        try:
-            sequence = self.sink.put_nowait(heading, payload, reserved=True, receipt=receipt)
-        except SpoolFull:
-            sequence = self.put_payload(heading, payload, receipt)
-        if self.feed.observers:
-            self.feed.publish(episode, sequence, event)
-        return sequence
-
-    def put_payload(self, heading: Heading, payload: bytes, receipt: Receipt | None = None) -> int:
-        """Append an encoded event and return its sequence."""
+    def put_payload(self, heading: Heading, payload: bytes) -> int:
+        """Append an encoded event and return its sequence; block while the spool and its reserve are full."""
         while True:
             try:
-                return self.sink.put_nowait(heading, payload, reserved=True, receipt=receipt)
+                return self.sink.put_nowait(heading, payload, reserved=True)
             except SpoolFull:
-                # The garbage collector may close a dropped plan in a thread of the memory. Such a thread must not
-                # block here, because these threads are the ones that free space.
-                if threading.current_thread().name.startswith(THREAD_NAME_PREFIX):
+                if is_of_memory():
                     raise
                 self.sink.block_until_room(_BLOCK_S)
 
@@ -394,19 +336,16 @@ class Emitter:
             raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer to drain it")
         return True
 
-    def put_declaration(self, declared: DeclaredType) -> None:
-        """Append the declaration of a designator type."""
-        kind = type(declared.declaration)
-        self.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
-        self.feed.note_type(declared.fingerprint, declared.declaration)
-
-    def offer(self, episode: EpisodeId, event: Happening) -> int:
-        """Append an event without using the reserve and without waiting; raise `SpoolFull` if there is no room."""
-        payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        sequence = self.sink.put_nowait(self._heading(episode, type(event)), payload)
-        if self.feed.observers:
-            self.feed.publish(episode, sequence, event)
-        return sequence
+    def put_declaration(self, declared: Declared) -> None:
+        """Append the declaration of a designator type; count the fields that have another name."""
+        own, kind = declared.type, type(declared.type.declaration)
+        for name, renamed in declared.fields.items():
+            self.missing.note_renamed(own.dtype, name, *renamed)
+        if declared.dtype is not None:
+            self.missing.note_renamed(own.dtype, "type", *declared.dtype)
+        if own.payload:
+            self.put_payload(Heading(None, kind.__name__, kind.version), own.payload)
+            self.feed.note_type(own.fingerprint, own.declaration)
 
     def put_blob(self, content: bytes, media_type: str) -> BlobReference:
         """Write a blob; return the reference for events put afterwards. Never waits.
@@ -423,23 +362,17 @@ class Emitter:
         except FilesError as error:
             raise BlobRefused(str(error)) from error
 
-    def release_blob(self, reference: BlobReference) -> None:
-        """State that no event put from now on refers to this blob because of one of its puts."""
-        self.sink.release_blob(reference.hash)
-
-    def _heading(self, episode: EpisodeId, kind: type[Happening]) -> Heading:
-        """Return the heading of an event; kept for the next one, because making it takes three times as long."""
-        key = (episode, kind)
-        heading = self._headings.get(key)
-        if heading is None:
-            if len(self._headings) >= _HEADINGS_MAX:
-                self._headings.clear()
-            heading = self._headings[key] = Heading(episode, kind.__name__, kind.version)
-        return heading
-
     def close(self, because: str = "the memory is closed") -> None:
         """Record nothing from now on; further reports are counted."""
         self._closed_because, self.is_closed = because, True
+
+    def note_missing(self, owner: str, reasons: Mapping[str, str], *, may_refuse: bool = False) -> None:
+        """Count missing values. Raises `Unrecordable` if `may_refuse` and with `on_unrecordable="refuse"`."""
+        refused = [name for name in reasons if name != "robot"]
+        if may_refuse and refused and self.settings.on_unrecordable == "refuse":
+            raise Unrecordable(owner, " and ".join(refused), reasons[refused[0]])
+        for name, reason in reasons.items():
+            self.missing.note(owner, name, reason)
 
     def note_unrecorded(self, what: str) -> None:
         """Count a report that came after `close`, and log a warning for the first."""
@@ -474,12 +407,8 @@ class Emitter:
 class EventSink(Protocol):
     """The producing end of a queue."""
 
-    def put_nowait(
-        self, heading: Heading, payload: bytes, *, reserved: bool = False, receipt: Receipt | None = None
-    ) -> int:
+    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
-
-        Writing the event sets the sequence of the receipt as well, even if Ctrl-C interrupts the call afterwards.
 
         Any thread may call it. Once it returns, the event survives the death of the process. Raises `SpoolFull` if
         there is no room; with `reserved`, only if the reserve for ends and world observations is used up as well.
@@ -513,6 +442,136 @@ class EventSink(Protocol):
         Logs a warning if it waits for more than two seconds. Raises `SpoolStuck` when waiting cannot help.
         """
         ...
+
+
+# === events that do not fit ===================================================================================
+#
+# Leave out what JSON cannot hold, and then the largest parts of an event that is too large, each as a whole.
+
+EPISODE_TEXT_MAX = 10_000
+"""Bounds the characters of an episode's description, plan and world, so that their columns stay readable."""
+_CUTS = (1_000, 100, 10)
+"""Characters to shorten a text to, tried in turn until the event fits."""
+_MISSING_BYTES = 400
+"""Bounds from below the values worth leaving out: about the encoded size of the `MissingValue` that replaces one."""
+ROBOT = "robot state"
+"""The name under which a missing robot state is counted; the blank keeps it apart from every field's name."""
+
+
+def episode_text_of(text: str) -> str:
+    """Clean and shorten a text for a column of an episode."""
+    return cut(clean(text), EPISODE_TEXT_MAX)
+
+
+def fitted(event: Happening, bytes_max: int) -> tuple[Happening, dict[str, str]]:
+    """Return the event without the parts that cannot be recorded, and the reason for each by its name.
+
+    A parameter or a result becomes a `MissingValue`, an observed value null, a text is cut, and any other part gets the
+    default of its field. Raises `NotEncodable` if a part without default cannot be recorded.
+    """
+    reasons: dict[str, str] = {}
+    for name in event.__struct_fields__:
+        value = getattr(event, name)
+        try:
+            encoded_bytes(value)
+        except NotEncodable as error:
+            reasons[ROBOT if name == "robot" else name] = error.reason
+            event = replace(event, **{name: _recordable(value, _defaults(event), name)})
+    whole = event
+    for turn, characters_max in enumerate(_CUTS):
+        sizes = {name: encoded_bytes(value) for name, value in _parts(event).items()}
+        for name in sorted(sizes, key=sizes.__getitem__, reverse=True):
+            if fits(event, bytes_max):
+                return event, reasons
+            reason = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for the record (record_bytes_max)"
+            value = _parts(event)[name]
+            is_small = sizes[name] <= _MISSING_BYTES and turn < len(_CUTS) - 1
+            if isinstance(value, MissingValue):
+                smaller: Any = MissingValue(value.missing) if turn else value
+            elif isinstance(event, NodeStarted | Observed) or name == "result":
+                smaller = value if is_small else missing_value(reason, value)
+            else:
+                smaller = _shorter(_parts(whole)[name], characters_max)
+            if smaller is not value:
+                reasons.setdefault(name, reason)
+                event = _with_part(event, name, smaller)
+    return event, reasons
+
+
+def _parts(event: Happening) -> dict[str, Any]:
+    """Return the parts of an event that can be left out: its parameters, its observed values, or its fields."""
+    if isinstance(event, NodeStarted):
+        return event.parameters
+    if isinstance(event, Observed):
+        return event.values if isinstance(event.values, dict) else {"": event.values}
+    return {name: value for name in event.__struct_fields__ if (value := getattr(event, name)) is not None}
+
+
+def _with_part(event: Happening, name: str, part: Any) -> Happening:
+    if isinstance(event, NodeStarted):
+        return replace(event, parameters=event.parameters | {name: part})
+    if isinstance(event, Observed):
+        values = event.values | {name: None} if isinstance(event.values, dict) else None
+        return replace(event, values=values, missing=event.missing | {name: part.missing})
+    return replace(event, **{name: part})
+
+
+def _shorter(part: Any, characters_max: int) -> Any:
+    if isinstance(part, str):
+        return cut(part, characters_max)
+    if isinstance(part, FailureValue):
+        return FailureValue(cut(part.type, _CUTS[0]), cut(part.message, characters_max))
+    return type(part)() if isinstance(part, tuple | dict) else part
+
+
+def _defaults(value: msgspec.Struct) -> dict[str, Any]:
+    fields, defaults = value.__struct_fields__, value.__struct_defaults__
+    return dict(zip(fields[len(fields) - len(defaults) :], defaults, strict=True))
+
+
+def _recordable(value: Any, defaults: Mapping[str, Any], name: str) -> Any:
+    """Return what JSON can hold of a field, or its default. Raises `NotEncodable` if that is nothing, without one."""
+    try:
+        return _clean(value)
+    except NotEncodable:
+        if name not in defaults:
+            raise
+        return defaults[name]
+
+
+def _clean(value: Any) -> Any:
+    """Clean texts, and leave out items and entries that JSON cannot hold. Raises `NotEncodable` if nothing is left."""
+    if isinstance(value, str):
+        return clean(value)
+    if isinstance(value, msgspec.Struct):
+        defaults = _defaults(value)
+        names = value.__struct_fields__
+        return replace(value, **{name: _recordable(getattr(value, name), defaults, name) for name in names})
+    if isinstance(value, dict):
+        entries = ((clean(key), _clean_or_none(each)) for key, each in value.items())
+        return {key: each for key, each in entries if each is not None}
+    if isinstance(value, list | tuple) and (
+        isinstance(value, list) or isinstance(next(iter(value), 0), msgspec.Struct)
+    ):
+        return type(value)(each for each in map(_clean_or_none, value) if each is not None)
+    encoded_bytes(value)
+    return value
+
+
+def _clean_or_none(value: Any) -> Any:
+    try:
+        return _clean(value)
+    except NotEncodable:
+        return None
+
+
+def fits(event: Happening, bytes_max: int) -> bool:
+    """Return whether the event can be encoded in `bytes_max` bytes."""
+    try:
+        encode(event, bytes_max=bytes_max)
+    except NotEncodable:
+        return False
+    return True
 
 
 # === episode arguments ========================================================================================
@@ -553,7 +612,7 @@ def read_labels(tags: Iterable[str], metadata: object, emitter: Emitter) -> Labe
     checked = checked_tags(tags)
     if not isinstance(metadata, Mapping) or not all(isinstance(key, str) for key in metadata):
         raise CallerError(f"the metadata of an episode must be a dict with text keys, not {metadata!r:.100}")
-    reader = ObservedReader(NO_REFERENCES, _refuse_blob)
+    reader = ValueReader(NO_REFERENCES, _refuse_blob)
     values = reader.read(dict(metadata)) or {}
     for path, reason in reader.missing.items():
         emitter.missing.note("Episode.metadata", path or "metadata", reason)
@@ -692,11 +751,18 @@ def end_statuses(failure: BaseException | None, failures: Failures = ()) -> tupl
     """Return the statuses of an episode, and of a node, that this exception left."""
     if failure is None:
         return "SUCCEEDED", "SUCCEEDED"
-    if is_plan_failure(failure) or isinstance(failure, failures):
+    if is_plan_failure(failure, failures):
         return "FAILED", "FAILED"
     if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt | SystemExit):
         return "INTERRUPTED", "CANCELLED"
     return "ERROR", "ERROR"
+
+
+def is_plan_failure(error: BaseException, failures: Failures) -> bool:
+    """Return whether it is a plan failure, one of these classes or of a plan layer, or a group of such only."""
+    if isinstance(error, ExceptionGroup):
+        return all(is_plan_failure(each, failures) for each in error.exceptions)
+    return isinstance(error, failures) or getattr(type(error), "__is_plan_failure__", False)
 
 
 def current_task() -> asyncio.Task[Any] | None:
@@ -723,72 +789,34 @@ def _user() -> str:
 
 _NAME_MAX = 1_000
 """Bounds the characters of a name, far above real names."""
-_PATH_BYTES_MAX = 8_192
-"""Bounds the bytes of paths and reasons in an event whose values did not fit."""
 
 
-def put_observation(
-    emitter: Emitter, episode: EpisodeWriter[Any], name: object, values: object, node: int, *, may_refuse: bool
-) -> int:
+def put_observation(episode: EpisodeWriter, name: object, values: object, node: int, *, may_refuse: bool) -> int:
     """Write values under this name, observed by the node with this sequence; return the sequence of the event.
 
     Returns 0 if the spool or the episode has no room; the observation is counted as missing then. Raises `Unrecordable`
     only if `may_refuse` and with `on_unrecordable="refuse"`.
     """
-    name = name_of(name)
-    reader = ObservedReader(episode, emitter.put_blob)
+    emitter, name = episode.emitter, name_of(name)
+    reader = ValueReader(episode, emitter.put_blob)
     event = Observed(name, reader.read(values), node, reader.missing)
+    owner = f"observation {name}"
     try:
         if reader.missing:
-            _note_missing(emitter, name, reader.missing, may_refuse=may_refuse)
-        return _put(emitter, episode, event, may_refuse=may_refuse)
+            reasons = {path or "values": reason for path, reason in reader.missing.items()}
+            emitter.note_missing(owner, reasons, may_refuse=may_refuse)
+        return episode.put(event, owner, may_refuse=may_refuse, reserved=False)
     except (EpisodeFull, SpoolFull, SpoolStuck) as refusal:
         emitter.missing.note("observation", name, str(refusal))
         return 0
     finally:
         for reference in reader.blobs:
-            emitter.release_blob(reference)
-
-
-def _put(emitter: Emitter, episode: EpisodeWriter[Any], event: Observed, *, may_refuse: bool) -> int:
-    try:
-        return emitter.offer(episode.id, event)
-    except NotEncodable as error:
-        fitted = _fit(event, error, emitter.settings.record_bytes_max)
-        new = {path: why for path, why in fitted.missing.items() if path not in event.missing}
-        _note_missing(emitter, event.name, new, may_refuse=may_refuse)
-        return emitter.offer(episode.id, fitted)
-
-
-def _note_missing(emitter: Emitter, name: str, missing: dict[str, str], *, may_refuse: bool) -> None:
-    if may_refuse and emitter.settings.on_unrecordable == "refuse":
-        path, reason = next(iter(missing.items()))
-        raise Unrecordable(f"observation {name!r}", path or "values", reason)
-    for path, reason in missing.items():
-        emitter.missing.note(f"observation {name}", path or "values", reason)
+            emitter.sink.release_blob(reference.hash)
 
 
 def name_of(name: object) -> str:
     """Return the text under which an observation of this name is recorded."""
     return cut(clean(name if isinstance(name, str) else clean_repr(name)), _NAME_MAX)
-
-
-def _fit(event: Observed, error: NotEncodable, bytes_max: int) -> Observed:
-    """Replace the largest values of a dict by null until the event fits; without a dict, the whole value."""
-    values = event.values
-    if not isinstance(values, dict) or len(event.missing) > len(values):
-        return replace(event, values=None, missing={"": error.reason})
-    sizes = {key: len(key) + encoded_bytes(each) for key, each in values.items()}
-    room = bytes_max - _PATH_BYTES_MAX - len(event.name) * 6
-    left, missing = dict(values), dict(event.missing)
-    for key in sorted(sizes, key=sizes.__getitem__, reverse=True):
-        if sum(sizes.values()) <= room:
-            break
-        reason = f"it takes {sizes.pop(key):,} bytes; {error.reason}"
-        left[key], missing[key] = None, reason
-    if encoded_bytes(left) + encoded_bytes(missing) > room:
-        return replace(event, values=None, missing={"": error.reason})
-    return replace(event, values=left, missing=missing)
 
 
 # === open episodes ============================================================================================
@@ -797,9 +825,6 @@ def _fit(event: Observed, error: NotEncodable, bytes_max: int) -> Observed:
 
 RECENT_MAX = 100
 """Bounds the ids in `recent`, because a process may open any number of episodes."""
-
-AnyWriter = EpisodeWriter[Any]
-"""The writer of an episode, whatever it identifies nodes by."""
 
 
 class OpenEpisodes:
@@ -814,7 +839,7 @@ class OpenEpisodes:
         self._emitter = emitter
         self._clock = clock
         self._randomness = randomness
-        self.by_id: dict[EpisodeId, AnyWriter] = {}
+        self.by_id: dict[EpisodeId, EpisodeWriter] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self._is_closing = False
         self._adding = threading.RLock()
@@ -824,7 +849,7 @@ class OpenEpisodes:
         """Make the id of a new episode."""
         return episode_id(self._clock.wall_ns(), self._randomness(10))
 
-    def add(self, episode: AnyWriter) -> None:
+    def add(self, episode: EpisodeWriter) -> None:
         """Add an episode. Raises `CallerError` after `refuse_new`."""
         with self._adding:
             if self._is_closing:
@@ -840,7 +865,7 @@ class OpenEpisodes:
             self._is_closing = True
 
     @property
-    def all(self) -> tuple[AnyWriter, ...]:
+    def all(self) -> tuple[EpisodeWriter, ...]:
         """The open episodes, oldest first."""
         return tuple(self.by_id.copy().values())
 
@@ -849,11 +874,11 @@ class OpenEpisodes:
         """The ids of the last 100 episodes opened, including ended ones, without simulations."""
         return tuple(map(episode_text, self._recent.copy()))
 
-    def last_opened(self) -> AnyWriter | None:
+    def last_opened(self) -> EpisodeWriter | None:
         """Return the open episode that was opened last in any context, without simulations; None without one."""
         return next((each for each in reversed(self.all) if not each.simulated and not each.closed), None)
 
-    def close(self, episode: AnyWriter, failure: BaseException | None) -> None:
+    def close(self, episode: EpisodeWriter, failure: BaseException | None) -> None:
         """Write the end of an episode; `failure` is the exception that ended it, or None. Exceptions are counted."""
         if self._emitter.is_closed:
             return

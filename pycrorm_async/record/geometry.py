@@ -11,16 +11,26 @@ import hashlib
 import os
 import zlib
 from collections.abc import Collection, Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from pycrorm_async.events.codec import Heading, NotEncodable, encode, fingerprint
 from pycrorm_async.events.types import BlobReference, BoxValue, DescriptionDeclared, LinkBoxValue, MeshValue
-from pycrorm_async.record.values import MissingValues, clean, cut, message_of
+from pycrorm_async.record.values import MissingValues, clean, clean_repr, cut, message_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.bounding_boxes import BoundingBox
-from pycrorm_async.world.model_boxes import link_boxes, mesh_files, meshed_links, with_mesh_files, without_textures
-from pycrorm_async.world.urdf_model import UrdfFault, read_model
+from pycrorm_async.world.model_boxes import (
+    described_mass_kg,
+    link_boxes,
+    mesh_files,
+    meshed_links,
+    shape_boxes,
+    with_mesh_files,
+    without_textures,
+)
+from pycrorm_async.world.pose import DescriptionNotLoadable
+from pycrorm_async.world.urdf_model import UrdfFault, read_model, urdf_text
 
 _KNOWN_MAX = 1_000
 """Bounds the descriptions kept, because a program may generate any number. When it is reached all are dropped."""
@@ -60,6 +70,44 @@ class Described(Protocol):
     def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
         """Return the boxes around the visual shapes of these links, in their frames, as far as they are known."""
         ...
+
+
+class ReadDescription:
+    """A description that no world has loaded; the boxes around its shapes are computed from their files."""
+
+    def __init__(self, text: str) -> None:
+        self.description_text = text
+
+    @cached_property
+    def links(self) -> Mapping[str, BoundingBox]:
+        return shape_boxes(self.description_text, visual=False)
+
+    def box_in_link(self, link: str) -> BoundingBox | None:
+        return self.links.get(link)
+
+    def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
+        return shape_boxes(self.description_text, visual=True, links=links)
+
+
+def urdf_of(name: str, urdf: Any, missing: MissingValues) -> str | None:
+    """Return the text of a URDF with the paths of its meshes, as a world reads it; faults are counted as missing.
+
+    The text is kept where a world would refuse it, because an executive may have loaded it elsewhere.
+    """
+    text = urdf if isinstance(urdf, str) and urdf.lstrip().startswith("<") else None
+    if urdf is None or (text is not None and "<mesh" not in text):
+        return text
+    try:
+        return urdf_text(name, text or Path(urdf))
+    except (DescriptionNotLoadable, TypeError) as error:
+        if text is None:  # declaring a text counts the mesh that does not exist, or the fault of the XML
+            missing.note("ObjectAdded", "urdf", f"{clean_repr(urdf)}: {message_of(error)}")
+        return text
+
+
+def mass_of(urdf: str | None, object_type: str) -> float | None:
+    """Return the mass of a described object, as `Object.mass_kg`; None for a robot or an environment."""
+    return described_mass_kg(urdf) if urdf is not None and object_type not in ("ROBOT", "ENVIRONMENT") else None
 
 
 class _DeclaredDescription(NamedTuple):

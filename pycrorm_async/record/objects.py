@@ -10,13 +10,10 @@ an event that names an object without a row would be damage.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from pycrorm_async.events.codec import NotEncodable
-from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import (
     Happening,
     JointsMoved,
@@ -29,11 +26,9 @@ from pycrorm_async.events.types import (
     PoseValue,
     RobotValue,
 )
-from pycrorm_async.record.episode_writer import Emitter
-from pycrorm_async.record.parameters import clean_texts
-from pycrorm_async.world.bounding_boxes import BoundingBox
-from pycrorm_async.world.model_boxes import shape_boxes
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.record.episode_writer import EpisodeWriter
+from pycrorm_async.record.geometry import ReadDescription
+from pycrorm_async.record.values import PoseLike, recorded_as
 
 K = TypeVar("K", bound=Hashable)
 
@@ -45,32 +40,29 @@ class ObjectRows(Generic[K]):
         last: sequence of the last event it recorded; 0 before the first.
     """
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId) -> None:
+    def __init__(self, episode: EpisodeWriter) -> None:
         self.last = 0
-        self._emitter = emitter
         self._episode = episode
+        self._emitter = episode.emitter
         self._references: dict[K, ObjectReference] = {}
 
-    def _put_removed(self, key: K, node: Callable[[], int | None]) -> int:
-        reference = self._references.pop(key, None)
-        return self._put(lambda: ObjectRemoved(reference, node())) if reference is not None else 0
+    def reference(self, key: K) -> ObjectReference | None:
+        """Return the current row of an object; None if there is none of this key."""
+        return self._references.get(key)
 
-    def _put_joints(self, key: K, positions: Mapping[str, float], node: Callable[[], int | None]) -> int:
+    def _put_removed(self, key: K, node: int | None) -> int:
+        reference = self._references.pop(key, None)
+        return self._put(lambda: ObjectRemoved(reference, node)) if reference is not None else 0
+
+    def _put_joints(self, key: K, positions: Mapping[str, float], node: int | None) -> int:
         reference = self._references.get(key)
-        return self._put(lambda: JointsMoved(reference, dict(positions), node())) if reference is not None else 0
+        return self._put(lambda: JointsMoved(reference, dict(positions), node)) if reference is not None else 0
 
     def _put_attachment(
-        self,
-        kind: type[ObjectAttached | ObjectDetached],
-        parent: K,
-        child: K,
-        link: str | None,
-        node: Callable[[], int | None],
+        self, kind: type[ObjectAttached | ObjectDetached], parent: K, child: K, link: str | None, node: int | None
     ) -> int:
         first, second = self._references.get(parent), self._references.get(child)
-        if first is None or second is None:
-            return 0
-        return self._put(lambda: kind(first, second, link, node()))
+        return self._put(lambda: kind(first, second, link, node)) if first is not None and second is not None else 0
 
     def _put(self, build: Callable[[], Happening], *, row_of: K | None = None, identity: int | None = None) -> int:
         """Build and record an event; return its sequence. Exceptions are counted, so that the change succeeds; 0 then.
@@ -80,13 +72,7 @@ class ObjectRows(Generic[K]):
         if self._emitter.is_closed:
             return 0
         try:
-            event = build()
-            try:
-                sequence = self._emitter.put(self._episode, event)
-            except NotEncodable as unencodable:
-                self._emitter.missing.note(type(event).__name__, "value", str(unencodable))
-                sequence = self._emitter.put(self._episode, clean_texts(event))
-            self.last = sequence
+            self.last = sequence = self._episode.put(build())
         except Exception as error:  # noqa: BLE001  a change of the world must not fail because of a memory
             self._emitter.note_fault("a change of the world", error)
             return 0
@@ -121,28 +107,11 @@ class RecordedObject:
     torso_joint: str | None = None
 
 
-class _Described:
-    """A description that no world has loaded; the boxes around its shapes are computed from their files."""
-
-    def __init__(self, text: str) -> None:
-        self.description_text = text
-
-    @cached_property
-    def links(self) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, visual=False)
-
-    def box_in_link(self, link: str) -> BoundingBox | None:
-        return self.links.get(link)
-
-    def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, visual=True, links=links)
-
-
 class RecordedObjects(ObjectRows[Hashable]):
     """The objects of one episode."""
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId) -> None:
-        super().__init__(emitter, episode)
+    def __init__(self, episode: EpisodeWriter) -> None:
+        super().__init__(episode)
         self._objects: dict[Hashable, RecordedObject] = {}
         self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
         self._identities: set[int] = set()
@@ -152,10 +121,6 @@ class RecordedObjects(ObjectRows[Hashable]):
         if reference is None:
             return True
         return reference.object in self._identities and reference.object <= reference.row <= self.last
-
-    def reference(self, key: Hashable) -> ObjectReference | None:
-        """Return the current row of an object; None if there is none of this key."""
-        return self._references.get(key)
 
     def names(self) -> Iterator[str]:
         """Yield the names of the objects."""
@@ -169,10 +134,14 @@ class RecordedObjects(ObjectRows[Hashable]):
         torso = state.joints.get(state.torso_joint) if state.torso_joint is not None else None
         return RobotValue(state.pose, state.object_type, torso, self._references.get(key), state.name)
 
-    def is_at(self, key: Hashable, pose: object) -> bool:
+    def is_at(self, key: Hashable, pose: Any) -> bool:
         """Return whether the last pose of an object is this one; False if no object has this key."""
         state = self._objects.get(key)
-        return state is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(state.pose, pose)
+        return (
+            state is not None
+            and (isinstance(pose, PoseValue) or recorded_as(type(pose)) == "pose")
+            and _are_at_one_place(state.pose, pose)
+        )
 
     def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
         """Write that an object entered the world; for a known key, write its new pose and joints."""
@@ -185,7 +154,7 @@ class RecordedObjects(ObjectRows[Hashable]):
                 added.pose,
                 dict(added.joints),
                 node,
-                self._emitter.descriptions.declare(_Described(added.urdf)) if added.urdf is not None else None,
+                self._emitter.descriptions.declare(ReadDescription(added.urdf)) if added.urdf is not None else None,
                 added.color,
                 added.model,
                 added.serial,
@@ -217,7 +186,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         """Write those joint positions of an object that have changed."""
         joints = self._objects[key].joints
         changed = {name: each for name, each in positions.items() if joints.get(name) != each}
-        sequence = self._put_joints(key, changed, lambda: node) if changed else 0
+        sequence = self._put_joints(key, changed, node) if changed else 0
         if sequence:
             joints.update(changed)
         return sequence
@@ -225,19 +194,19 @@ class RecordedObjects(ObjectRows[Hashable]):
     def attach(self, parent: Hashable, child: Hashable, link: str | None, node: int | None) -> int:
         """Write that `child` moves with `parent`."""
         self._attached[parent, child] = link
-        return self._put_attachment(ObjectAttached, parent, child, link, lambda: node)
+        return self._put_attachment(ObjectAttached, parent, child, link, node)
 
     def detach(self, parent: Hashable, child: Hashable, node: int | None) -> int:
         """Write that `child` no longer moves with `parent`."""
         link = self._attached.pop((parent, child), None)
-        return self._put_attachment(ObjectDetached, parent, child, link, lambda: node)
+        return self._put_attachment(ObjectDetached, parent, child, link, node)
 
     def remove(self, key: Hashable, node: int | None) -> int:
         """Write that an object left the world."""
         self._objects.pop(key, None)
         self._attached = {pair: link for pair, link in self._attached.items() if key not in pair}
-        return self._put_removed(key, lambda: node)
+        return self._put_removed(key, node)
 
 
-def _are_at_one_place(pose: Pose | PoseValue, other: Pose | PoseValue) -> bool:
+def _are_at_one_place(pose: PoseLike | PoseValue, other: PoseLike | PoseValue) -> bool:
     return pose.position == other.position and pose.orientation == other.orientation and pose.frame == other.frame

@@ -1,4 +1,4 @@
-"""The `Recorder` receives the reports of the plan and the world, and passes each to its episode.
+"""The hooks of our own plan layer: the `Recorder` receives the reports of plans and worlds, and writes their episodes.
 
 Theory of operation. The plan layer and the world call the recorder synchronously, in the thread and context of the
 plan. `current_episode` holds the episode of a context. It is used only if it is open in this memory and if it is a
@@ -12,18 +12,18 @@ own. Only the caller's settings let an exception reach a plan, and only before `
 value that cannot be recorded is recorded as missing.
 
 `node_ended` may also run in a thread and context of the garbage collector, when it closes a plan that was dropped
-unfinished. So it resets `current_episode` only if the context still holds the node's episode.
+unfinished, and between any two bytecodes of that thread. So it resets `current_episode` only if the context still holds
+the node's episode, and it takes no lock.
 """
 
 from __future__ import annotations
 
-import logging
+import math
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextvars import ContextVar
-from typing import Any, Literal
+from typing import Any, Final, Literal, NamedTuple
 
-from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.errors import (
     DeclarationRefused,
     EpisodeFull,
@@ -33,59 +33,171 @@ from pycrorm_async.errors import (
     SpoolStuck,
     Unrecordable,
 )
-from pycrorm_async.events.types import Blob, NodeReference, StateSampled
-from pycrorm_async.plan.execution import CalledPerforms, Candidate, Cells, Refusal, Seen, Simulation, current_simulation
+from pycrorm_async.events.types import (
+    Blob,
+    CandidateValue,
+    CellsValue,
+    LocationResolved,
+    NodeReference,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectReference,
+    PoseValue,
+    RefusalValue,
+    RobotValue,
+    SeenValue,
+    StateSampled,
+)
+from pycrorm_async.plan.execution import CalledPerforms, Search, Seen, Simulation, current_simulation
+from pycrorm_async.plan.execution import recorder as plan_observer
+from pycrorm_async.plan.language import Designator
+from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.plan.task import TaskTreeNode, current_node
-from pycrorm_async.record.declarations import Declarations, KnownTypes
-from pycrorm_async.record.episode import Episode, NodeRecord
 from pycrorm_async.record.episode_writer import (
-    NO_LABELS,
+    EPISODE_TEXT_MAX,
+    UNAWAITED_MAX,
     Emitter,
     EpisodeOpening,
     EpisodeWriter,
-    Labels,
-    OpenEpisodes,
-    Provenance,
-    check_arguments,
     current_task,
+    episode_text_of,
     name_of,
     put_observation,
 )
-from pycrorm_async.record.parameters import EPISODE_TEXT_MAX
+from pycrorm_async.record.objects import ObjectRows
+from pycrorm_async.record.plan_types import Declarations
+from pycrorm_async.record.recording import Recording
+from pycrorm_async.record.values import clean, encode_or_missing, failure_value, pose_value, read_parameters
 from pycrorm_async.world.bullet import BulletWorld, Object, current_world
-from pycrorm_async.world.pose import ObjectType
-from pycrorm_async.world.world_copy import acting_robot
+from pycrorm_async.world.pose import ObjectType, Pose
+from pycrorm_async.world.world_copy import acting_robot, counterpart, related
 
-_log = logging.getLogger("pycrorm_async")
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
 """The innermost episode opened in this context; it may be closed already."""
+
+
+class NodeRecord(NamedTuple):
+    """The hooks' record of a running node, kept as `TaskTreeNode.record`.
+
+    Attributes:
+        episode: the episode that recorded the node.
+        sequence: sequence of the node's NodeStarted; its id.
+        implicit: whether the episode was opened for this node alone and ends with it.
+        outer_episode: the current episode of the context before the node started.
+    """
+
+    episode: Episode
+    sequence: int
+    implicit: bool
+    outer_episode: Episode | None
+
+
+class Episode(EpisodeWriter):
+    """An open or closed episode of our own plan layer.
+
+    Attributes:
+        task: the asyncio task that opened the episode; None outside any task.
+        world: the recorder of its world; None without a world.
+        faults: faults of the plan, each type once: performs that were never awaited.
+        calls: performs called in the episode's context.
+    """
+
+    def __init__(self, recording: Recording, opening: EpisodeOpening) -> None:
+        super().__init__(recording.emitter, recording.episodes.new_id(), opening)
+        self.task = current_task()
+        self.world: WorldRecorder | None = None
+        self.faults: tuple[str, ...] = ()
+        self.calls: Final = CalledPerforms(self._note_unawaited)
+        self._entered_world: str | None = None
+
+    def enter_world(self, world: BulletWorld) -> None:
+        """Record this world from now on. A second world at the same time is not recorded, but counted as missing."""
+        if self.world is None:
+            self.world = WorldRecorder(self, world)
+        elif self.world.world is not world:
+            self.emitter.missing.note("Episode", "second world", f"{self} records only the world entered first")
+
+    @property
+    def acts_in_recorded_world(self) -> bool:
+        """True if the current world of this context is the recorded world, not a second one."""
+        return self.world is not None and current_world.get() in (None, self.world.world)
+
+    def leave_world(self, world: BulletWorld, *, emptied: bool) -> None:
+        """Stop recording this world; with `emptied`, record first that all its objects were removed."""
+        if self.world is not None and self.world.world is world:
+            if self._opening.world is None:
+                self._entered_world = episode_text_of(world.description)
+            if emptied:
+                self.world.empty()
+            self.world.stop()
+            self.world = None
+
+    def reference(self, world_object: Object, /) -> ObjectReference | None:
+        """Return the object's current row in this episode; None without a row."""
+        return self.world.reference(world_object) if self.world is not None else None
+
+    def node_reference(self, node: TaskTreeNode | None) -> NodeReference:
+        """Return a reference to this node, or to its nearest recorded ancestor; None gives the root."""
+        return NodeReference(str(self), self.node_or_root(node))
+
+    def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
+        """Write the end of the episode, after reporting performs that were never awaited."""
+        if not self.closed:
+            self.calls.close()
+        if self.world is not None:
+            self.leave_world(self.world.world, emptied=False)
+        super().end_episode(failure, world or self._entered_world)
+
+    def _note_unawaited(self, designator: type[Designator]) -> None:
+        self.emitter.note_unawaited(designator.__dtype__)
+        fault = f"{designator.__dtype__}.perform() was called and never awaited"
+        if fault not in self.faults:
+            self.faults = (*self.faults[1 - UNAWAITED_MAX :], fault)
+
+    def node_or_root(self, node: TaskTreeNode | None, /) -> int:
+        """Return the sequence of this node or of its nearest recorded ancestor; None gives the root."""
+        while node is not None:
+            record: NodeRecord | None = node.record
+            if record is not None and record.episode is self:
+                return record.sequence
+            node = node.parent
+        return self._root
+
+    def sequence_of(self, node: TaskTreeNode | None) -> int | None:
+        """Return the sequence of this node or of its nearest recorded ancestor; None without one."""
+        sequence = self.node_or_root(node)
+        return sequence if sequence != self._root else None
+
+    def robot_state(self) -> RobotValue | None:
+        """Return the state of the robot that acts in this context; None without one, and in a second world."""
+        if self.world is None:
+            return None
+        if not self.acts_in_recorded_world:
+            self.emitter.missing.note("Episode", "robot of a second world", "the episode records only the first world")
+            return None
+        try:
+            return self.world.robot()
+        except Exception as error:  # noqa: BLE001  the node is recorded without the robot's state
+            self.emitter.note_fault("robot state", error)
+            return None
 
 
 class Recorder:
     """Implements the plan layer's `PlanObserver` and the world's `WorldWatcher` for one memory."""
 
-    def __init__(
-        self,
-        emitter: Emitter,
-        *,
-        episodes: OpenEpisodes,
-        software: str,
-        provenance: Provenance | None = None,
-    ) -> None:
-        self._emitter = emitter
-        self.episodes = episodes
-        self._software = software
-        self._provenance = provenance
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._emitter = emitter = recording.emitter
+        self.episodes = recording.episodes
         self._strict = emitter.settings.on_unrecordable == "refuse"
-        self._declarations = Declarations(strict=self._strict)
+        self._declarations = Declarations(recording.known_types, strict=self._strict)
         self._sampler = _sampler_of(emitter)
+        self._kept: set[tuple[str, str]] = set()
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "__dtype__", "it")))
         """Performs called outside any episode."""
-
-    @property
-    def known_types(self) -> KnownTypes:
-        """The types declared in this memory, by any executive."""
-        return self._declarations.known
 
     @property
     def is_closed(self) -> bool:
@@ -94,10 +206,8 @@ class Recorder:
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
-    def open_episode(
-        self, *, description: str, plan: str | None = None, seed: int | None = None, labels: Labels = NO_LABELS
-    ) -> Episode:
-        """Open an episode in this context; `close_episode` ends it.
+    def open_episode(self, *, description: str, **arguments: Any) -> Episode:
+        """Open an episode in this context; `close_episode` ends it. `Recording.opening` has the arguments.
 
         Raises `EpisodeRefused` if this task has an open episode, `CallerError` for an argument that does not fit.
         """
@@ -106,26 +216,16 @@ class Recorder:
             raise EpisodeRefused(
                 f"episode {open_episode} is open in this task already: end it first, or open the other in its own task"
             )
-        check_arguments(description=description, plan=plan, seed=seed, strict=self._strict)
-        return self._start(description, plan=plan, seed=seed, labels=labels)
-
-    def _start(
-        self, description: str, *, plan: str | None = None, seed: int | None = None, labels: Labels = NO_LABELS
-    ) -> Episode:
-        """Start an episode; a simulation if this context is in one."""
         simulation, world = current_simulation.get(), current_world.get()
-        opening = EpisodeOpening(
+        opening = self._recording.opening(
             description,
-            self._software,
-            plan,
-            seed,
-            world.description if world else None,
+            world=world.description if world else None,
             simulated=simulation is not None,
             thought_by=_simulating_node(simulation),
-            provenance=self._provenance,
-            labels=labels,
+            strict=self._strict,
+            **arguments,
         )
-        episode = Episode(self._emitter, self.episodes.new_id(), opening)
+        episode = Episode(self._recording, opening)
         self.episodes.add(episode)  # first, so that the memory ends an episode whose start Ctrl-C interrupted
         try:
             episode.open()
@@ -138,10 +238,10 @@ class Recorder:
             episode.enter_world(world)
         return episode
 
-    def close_episode(self, episode: EpisodeWriter[Any], failure: BaseException | None) -> None:
+    def close_episode(self, episode: EpisodeWriter, failure: BaseException | None) -> None:
         """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
         if self._sampler is not None and not self._emitter.is_closed:
-            self._sample(self._sampler.stop_episode, episode)
+            self._guarded("StateSampled", self._sampler.stop_episode, episode)
         self.episodes.close(episode, failure)
 
     @property
@@ -162,11 +262,6 @@ class Recorder:
             return None
         return episode if episode.simulated is (current_simulation.get() is not None) else None
 
-    def episode_of(self, node: TaskTreeNode) -> Episode | None:
-        """Return the open episode of this memory in which the node is recorded; None without one."""
-        record: NodeRecord | None = node.record
-        return record.episode if record is not None and record.episode.id in self.episodes.by_id else None
-
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 
     def admit(self) -> Awaitable[None] | None:
@@ -176,75 +271,72 @@ class Recorder:
         return sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:
-        assert node.designator is not None
-        if self._emitter.is_closed:
-            self._emitter.note_unrecorded(node.designator.__dtype__)
+        designator, emitter = node.designator, self._emitter
+        assert designator is not None
+        if emitter.is_closed:
+            emitter.note_unrecorded(designator.__dtype__)
             return
         outer_episode = current_episode.get()
         implicit: Episode | None = None
         try:
-            declared = self._declarations.of(type(node.designator), self._emitter.put_declaration)
+            kind = type(designator)
+            declared = self._declarations.declared.get(kind) or self._declarations.of(kind, emitter.put_declaration)
             episode = self.episode_here()
             if episode is None:
                 dtype = declared.dtype
                 episode = implicit = self.open_episode(description=dtype, plan=dtype)
-            sequence = episode.start_node(node, declared)
+            missing: dict[str, str] = {}
+            parameters = read_parameters(designator, declared.fields, episode, missing)
+            robot = episode.robot_state() if episode.world is not None else None
+            sequence = episode.put_start(
+                declared, node.kind, episode.node_or_root(node.parent), parameters, robot, missing, may_refuse=True
+            )
         except BaseException as error:
             if implicit is not None:
                 self.close_episode(implicit, error)
             if isinstance(error, Unrecordable | DeclarationRefused) or not isinstance(error, Exception):
                 raise
-            self._emitter.note_fault("NodeStarted", error)  # a fault of the memory must not reach a plan
-        else:
-            node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode)
-            if implicit is not None:
-                current_episode.set(implicit)
-            if declared.fault is not None:
-                self._emitter.missing.note(declared.dtype, "type", declared.fault)
-            if self._sampler is not None and node.kind == "motion" and episode.acts_in_recorded_world:
-                self._sample(self._sampler.begin, episode, sequence)
+            emitter.note_fault("NodeStarted", error)  # a fault of the memory must not reach a plan
+            return
+        node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode)
+        if implicit is not None:
+            current_episode.set(implicit)
+        if declared.fault is not None:
+            emitter.missing.note(declared.dtype, "type", declared.fault)
+        if self._sampler is not None and node.kind == "motion" and episode.acts_in_recorded_world:
+            self._guarded("StateSampled", self._sampler.begin, episode, sequence)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
         if record is None or self._emitter.is_closed:
             return
+        episode, sequence = record.episode, record.sequence
         if self._sampler is not None and node.kind == "motion":
-            self._sample(self._sampler.end, record.episode, record.sequence)
+            self._guarded("StateSampled", self._sampler.end, episode, sequence)
         try:
-            record.episode.end_node(node)
+            failure = failure_value(node.failure, episode) if node.failure is not None else None
+            result = encode_or_missing(node.result, episode) if node.result is not None else None
+            episode.put_end(sequence, node.status._value_, failure, result)  # `value` takes 0.1 µs longer
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("NodeEnded", error)
         if record.implicit:
-            self.close_episode(record.episode, node.failure)
-            if current_episode.get() is record.episode:  # the garbage collector may close the plan in another context
+            self.close_episode(episode, node.failure)
+            if current_episode.get() is episode:  # the garbage collector may close the plan in another context
                 current_episode.set(record.outer_episode)
 
-    def location_resolved(
-        self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        refused: tuple[Refusal, ...], offered_beyond: int, cells: Cells | None, node: TaskTreeNode | None,
-    ) -> None:  # fmt: skip
-        episode = self.episode_here()
-        if episode is None or self._emitter.is_closed:
-            return
-        try:
-            episode.record_location(
-                location=location, offered=offered, taken=taken, considered=considered, refused=refused,
-                offered_beyond=offered_beyond, cells=cells, node=node,
-            )  # fmt: skip
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("LocationResolved", error)
+    def location_resolved(self, search: Search) -> None:
+        self._in_episode(
+            "LocationResolved",
+            lambda episode: episode.put(
+                location_resolved(search, episode.sequence_of(search.node)), clean(search.location)
+            ),
+        )
 
-    def object_detected(
-        self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
-        node: TaskTreeNode | None,
-    ) -> None:  # fmt: skip
-        episode = self.episode_here()
-        if episode is None or self._emitter.is_closed:
-            return
-        try:
-            episode.record_detection(source=source, object_type=object_type, seen=seen, node=node)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("ObjectDetected", error)
+    def object_detected(self, *, node: TaskTreeNode | None, **percepts: Any) -> None:
+        self._in_episode(
+            "ObjectDetected",
+            lambda episode: episode.put(object_detected(episode, node=episode.sequence_of(node), **percepts)),
+        )
 
     def simulation_started(self, simulation: Simulation) -> None:
         if self._emitter.is_closed:
@@ -253,11 +345,11 @@ class Recorder:
         simulation.record = record = _SimulationRecord(
             outer.node_reference(simulation.by) if outer is not None else None, outer
         )
-        try:
-            record.episode = self._start(_description_of(simulation))
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("EpisodeStarted", error)
-        # None if the episode could not start, so that no simulated event gets into the outer episode.
+        current_episode.set(None)  # so that no simulated event gets into the outer episode if this one cannot start
+        self._guarded("EpisodeStarted", self._start_simulation, simulation, record)
+
+    def _start_simulation(self, simulation: Simulation, record: _SimulationRecord) -> None:
+        record.episode = self.open_episode(description=_description_of(simulation))
         current_episode.set(record.episode)
 
     def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
@@ -269,27 +361,77 @@ class Recorder:
         if current_episode.get() is record.episode:  # the garbage collector may close the plan in another context
             current_episode.set(record.outer_episode)
 
-    def _sample(self, step: Callable[..., None], *arguments: object) -> None:
-        try:
-            step(*arguments)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("StateSampled", error)
-
     # --- the port of the world ---------------------------------------------------------------------------------------
 
     def world_entered(self, world: BulletWorld) -> None:
-        episode = self.episode_here()
-        if episode is None or self._emitter.is_closed:
-            return
-        try:
-            episode.enter_world(world)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not prevent entering a world
-            self._emitter.note_fault("entering a world", error)
+        self._in_episode("entering a world", lambda episode: episode.enter_world(world))
 
     def world_left(self, world: BulletWorld) -> None:
-        episode = self.episode_here()
-        if episode is not None:
+        if (episode := self.episode_here()) is not None:
             episode.leave_world(world, emptied=True)
+
+    # --- observations of a program -----------------------------------------------------------------------------------
+
+    def observe(self, name: str, values: object, *, node: TaskTreeNode | None) -> None:
+        """Record values under this name. Raises `Unrecordable` with `on_unrecordable="refuse"` only.
+
+        A thread without the plan's context, such as the callback of a sensor, observes for the episode that this memory
+        opened last.
+        """
+        if self.is_closed:
+            self._emitter.note_unrecorded(f"the observation {name_of(name)}")
+            return
+        self._guarded("Observed", lambda: self._observe(name, values, node, may_refuse=True))
+
+    def keep(self, name: str, key: str, content: Callable[[], Blob]) -> None:
+        """Record a content that nodes name by this key, once for all episodes of the memory.
+
+        Outside an episode nothing is recorded; the next call tries again, also where the spool had no room.
+        """
+        if not self.is_closed and (name, key) not in self._kept and self.episode_here() is not None:
+            self._guarded("Observed", self._keep, name, key, content)
+
+    def _keep(self, name: str, key: str, content: Callable[[], Blob]) -> None:
+        if self._observe(name, {key: content()}, None, may_refuse=False):
+            self._kept.add((name, key))
+
+    def _observe(self, name: str, values: object, node: TaskTreeNode | None, *, may_refuse: bool) -> int:
+        """Return the sequence of the event; 0 if it was counted as missing."""
+        own = self.episode_here()
+        episode: EpisodeWriter | None
+        if node is not None:
+            record: NodeRecord | None = node.record
+            episode = record.episode if record is not None and record.episode.id in self.episodes.by_id else None
+        elif own is not None:
+            episode, node = own, current_node.get()
+        else:
+            episode = self.episodes.last_opened()
+        if episode is None:
+            self._emitter.missing.note("observation", name_of(name), "no episode is open")
+            return 0
+        return put_observation(episode, name, values, episode.node_or_root(node), may_refuse=may_refuse)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _in_episode(self, event_type: str, write: Callable[[Episode], object]) -> None:
+        episode = self.episode_here()
+        if episode is not None and not self._emitter.is_closed:
+            self._guarded(event_type, write, episode)
+
+    def _guarded(self, event_type: str, step: Callable[..., object], *arguments: object) -> None:
+        """Call a step; a fault of the memory is counted and does not reach the plan."""
+        try:
+            step(*arguments)
+        except Unrecordable:
+            raise
+        except Exception as error:  # noqa: BLE001  counted
+            self._emitter.note_fault(event_type, error)
+
+
+def observing() -> Recorder | None:
+    """Return the recorder of the memory that records this context; None without an open memory."""
+    observer = plan_observer.get()
+    return observer if isinstance(observer, Recorder) else None
 
 
 def _sampler_of(emitter: Emitter) -> Sampler | None:
@@ -325,6 +467,205 @@ def _description_of(simulation: Simulation) -> str:
     if simulation.by is not None and simulation.by.designator is not None:
         return f"simulation in {simulation.by.designator.__dtype__}"
     return "simulation"
+
+
+# === episode events ===========================================================================================
+#
+# Build the events of resolved locations and of perception from values of the plan.
+
+
+def location_resolved(search: Search, node: int | None) -> LocationResolved:
+    """Build the event of a resolved location designator; `node` is the sequence of the node that resolved it."""
+    cells = search.cells
+    return LocationResolved(
+        location=clean(search.location),
+        offered=tuple(
+            CandidateValue(
+                pose_value(each.pose),
+                tuple(arm.name for arm in each.arms),
+                each.grasp.name if each.grasp is not None else None,
+                each.torso_height,
+            )
+            for each in search.offered
+        ),
+        taken=search.taken,
+        considered=search.considered,
+        node=node,
+        refused=tuple(RefusalValue(pose_value(each.pose), clean(each.reason)) for each in search.refused),
+        offered_beyond=search.offered_beyond,
+        cells=CellsValue(cells.occupied, cells.hidden, cells.free) if cells is not None else None,
+    )
+
+
+def object_detected(
+    references: Episode,
+    *,
+    source: Literal["camera", "world_state"],
+    object_type: ObjectType | None,
+    seen: Sequence[Seen],
+    node: int | None,
+) -> ObjectDetected:
+    """Build the event of a result of perception; `node` is the sequence of the node that requested it."""
+    values = tuple(_seen_value(each, references) for each in seen)
+    return ObjectDetected(source, object_type.name if object_type is not None else None, values, node)
+
+
+def _seen_value(seen: Seen, references: Episode) -> SeenValue:
+    thing = seen.thing
+    world_object = thing.world_object if isinstance(thing, ObjectDesignator) else thing
+    return SeenValue(  # perception often computes numbers of numpy
+        clean(thing.name),
+        thing.object_type.name,
+        pose_value(seen.pose if seen.pose is not None else thing.pose),
+        references.reference(world_object) if world_object is not None else None,
+        float(seen.visible) if seen.visible is not None else None,
+        float(seen.confidence) if seen.confidence is not None else None,
+        clean(seen.source) if seen.source is not None else None,
+    )
+
+
+# === world recorder ===========================================================================================
+#
+# The `WorldRecorder` turns changes of one world into events of one episode and keeps each object's current row.
+#
+# Theory of operation. The world calls its observer synchronously from its setters, in the thread of the plan. Each call
+# builds one event and puts it into the queue at once, so the values are those of that moment and the events have the
+# order of the changes. The rows of the objects, and what happens if an event cannot be written, are those of
+# `ObjectRows`.
+#
+# The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world.
+
+
+class WorldRecorder(ObjectRows[Object]):
+    """Observes one world for one episode; the constructor records the present state of the world.
+
+    Attributes:
+        world: the observed world.
+        sampled: for each robot, the last sampled value of each channel in this episode.
+    """
+
+    def __init__(self, episode: Episode, world: BulletWorld) -> None:
+        super().__init__(episode)
+        self.world = world
+        self.sampled: dict[Object, dict[str, float]] = {}
+        self._robots: dict[Object, tuple[Pose, PoseValue, str]] = {}
+        for each in world.objects:
+            self.object_added(each)
+        for each in world.objects:
+            for child, link in each.attachments.items():
+                self.object_attached(each, child, link)
+        world.observe(self)
+
+    def empty(self) -> None:
+        """Record that all objects were removed, because the world was closed."""
+        for each in tuple(self._references):
+            self.object_removed(each)
+
+    def stop(self) -> None:
+        """Stop observing the world; `reference` still works."""
+        self.world.unobserve(self)
+
+    def reference(self, world_object: Object) -> ObjectReference | None:
+        """Return the current row of this object, or of its counterpart if it is in a copy of this world; else None."""
+        row = self._references.get(world_object)
+        if row is None and world_object.world is not self.world and related(world_object.world, self.world):
+            local_object = counterpart(world_object, self.world)
+            row = self._references.get(local_object) if local_object is not None else None
+        return row
+
+    def robot(self) -> RobotValue | None:
+        """Return base pose and torso height of the robot that acts in this context; None without a robot."""
+        robot = acting_robot(self.world)
+        if robot is None:
+            return None
+        pose = robot.pose
+        recorded = self._robots.get(robot)
+        if recorded is None or recorded[0] is not pose:
+            self._robots[robot] = recorded = (pose, pose_value(pose), clean(robot.name))
+        description = robot.robot_description
+        torso = description.torso_joint if description is not None else None
+        return RobotValue(
+            recorded[1],
+            robot.object_type._name_,  # `name` takes 0.1 µs longer
+            robot.joint_position(torso) if torso is not None else None,
+            self._references.get(robot),
+            recorded[2],
+        )
+
+    # --- the world's observer ---------------------------------------------------------------------------------
+
+    def object_added(self, added: Object) -> None:
+        self._put(
+            lambda: ObjectAdded(
+                clean(added.name),
+                added.object_type.name,
+                pose_value(added.pose),
+                dict(added.joint_positions()),
+                self._causing_node(),
+                self._emitter.descriptions.declare(added),
+                self._color(added),
+                *_model(added),
+                added.mass_kg,
+                clean(added.base_link) or None,
+            ),
+            row_of=added,
+        )
+
+    def _color(self, added: Object) -> tuple[float, float, float, float] | None:
+        if added.color is None:
+            return None
+        red, green, blue, opacity = map(float, added.color)
+        if not all(map(math.isfinite, (red, green, blue, opacity))):
+            self._emitter.missing.note("ObjectAdded", "color", f"{added.color} is not finite")
+            return None
+        return red, green, blue, opacity
+
+    def object_removed(self, removed: Object) -> None:
+        self._robots.pop(removed, None)
+        self._put_removed(removed, self._causing_node())
+
+    def object_moved(self, moved: Object) -> None:
+        reference = self._references.get(moved)
+        if reference is None:
+            return
+        self._put(
+            lambda: ObjectMoved(
+                reference.object,
+                clean(moved.name),
+                moved.object_type.name,
+                pose_value(moved.pose),
+                self._causing_node(),
+            ),
+            row_of=moved,
+            identity=reference.object,
+        )
+
+    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
+        self._put_joints(moved, positions, self._causing_node())
+
+    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
+        self._put_attachment(ObjectAttached, parent, child, link, self._causing_node())
+
+    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
+        self._put_attachment(ObjectDetached, parent, child, link, self._causing_node())
+
+    def _causing_node(self) -> int | None:
+        """Return the node that caused a change: the context's innermost recorded node, if this episode recorded it."""
+        node = current_node.get()
+        while node is not None and node.record is None:
+            node = node.parent
+        if node is not None and node.record.episode is self._episode:
+            sequence: int = node.record.sequence
+            return sequence
+        return None
+
+
+def _model(added: Object) -> tuple[str | None, str | None]:
+    """Return model and serial of a robot; None for other objects, and for each that its description lacks."""
+    described = added.robot_description
+    if described is None:
+        return None, None
+    return clean(described.name), clean(described.serial) if described.serial is not None else None
 
 
 # === sampler ==================================================================================================
@@ -404,12 +745,12 @@ class Sampler:
                 self._sample(motion, margin=0.0)
                 motion.is_over = True
 
-    def stop_episode(self, episode: EpisodeWriter[Any]) -> None:
+    def stop_episode(self, episode: EpisodeWriter) -> None:
         """Stop sampling all motions of an episode, before the episode ends."""
         with self._lock:
             self._stop_motions(episode)
 
-    def _stop_motions(self, episode: EpisodeWriter[Any]) -> None:  # without a loop in `with`: see `OrderedCalls`
+    def _stop_motions(self, episode: EpisodeWriter) -> None:  # without a loop in `with`: see `OrderedCalls`
         for key in [key for key in self._running if key[0] is episode]:
             self._running.pop(key).is_over = True
 
@@ -462,7 +803,7 @@ class Sampler:
         if not changed or motion.is_over or self._emitter.is_closed:
             return
         try:
-            self._emitter.offer(motion.episode.id, StateSampled(reference, changed, motion.node))
+            motion.episode.put(StateSampled(reference, changed, motion.node), reserved=False)
         except (EpisodeFull, SpoolFull, SpoolStuck):
             self.omitted += 1
             return
@@ -477,69 +818,3 @@ def _read_channels(robot: Object) -> dict[str, float]:
     qx, qy, qz, qw = pose.orientation
     base = {"base.x": x, "base.y": y, "base.z": z, "base.qx": qx, "base.qy": qy, "base.qz": qz, "base.qw": qw}
     return base | robot.joint_positions()
-
-
-# === observations =============================================================================================
-#
-# Record the observations that a program makes itself, from any thread.
-#
-# A thread without the plan's context, such as the callback of a sensor, observes for the episode that this memory
-# opened last.
-
-
-class Observations:
-    """Records observations of one memory."""
-
-    def __init__(self, emitter: Emitter, recorder: Recorder) -> None:
-        self._emitter = emitter
-        self._recorder = recorder
-        self._kept: set[tuple[str, str]] = set()
-
-    @property
-    def is_closed(self) -> bool:
-        """True if the memory is closed, or belongs to the process that forked this one."""
-        return self._emitter.is_closed
-
-    def observe(self, name: str, values: object, *, node: TaskTreeNode | None) -> None:
-        """Record values under this name. Raises `Unrecordable` with `on_unrecordable="refuse"` only."""
-        if self.is_closed:
-            self._emitter.note_unrecorded(f"the observation {name_of(name)}")
-            return
-        try:
-            self._observe(name, values, node)
-        except Unrecordable:
-            raise
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("Observed", error)
-
-    def keep(self, name: str, key: str, content: Callable[[], Blob]) -> None:
-        """Record a content that nodes name by this key, once for all episodes of the memory.
-
-        Outside an episode nothing is recorded; the next call tries again, also where the spool had no room.
-        """
-        if self.is_closed or (name, key) in self._kept or self._recorder.episode_here() is None:
-            return
-        try:
-            if self._observe(name, {key: content()}, None):
-                self._kept.add((name, key))
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("Observed", error)
-
-    def _observe(self, name: str, values: object, node: TaskTreeNode | None) -> int:
-        """Return the sequence of the event; 0 if it was counted as missing."""
-        own = self._recorder.episode_here()
-        episode: EpisodeWriter[Any] | None
-        if node is not None:
-            episode = self._recorder.episode_of(node)
-        elif own is not None:
-            episode, node = own, current_node.get()
-        else:
-            episode = self._recorder.episodes.last_opened()
-        if episode is None:
-            self._emitter.missing.note("observation", name_of(name), "no episode is open")
-            return 0
-        return put_observation(self._emitter, episode, name, values, episode.node_or_root(node), may_refuse=True)
-
-
-observations: ConnectedVar[Observations] = ConnectedVar("observations")
-"""The observations of the memory that records this context; None without an open memory."""

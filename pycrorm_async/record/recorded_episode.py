@@ -8,11 +8,9 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
-from functools import partial
 from os import PathLike
-from pathlib import Path
 from types import TracebackType
-from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeAlias, TypeVar, get_args
+from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar, cast, get_args
 
 import msgspec
 from msgspec.structs import replace
@@ -23,7 +21,6 @@ from pycrorm_async.events.reasons import UNNAMED, template_of
 from pycrorm_async.events.types import (
     EpisodeStatus,
     FailureValue,
-    NodeEnded,
     NodeReference,
     NodeStatus,
     ObjectDetected,
@@ -33,46 +30,44 @@ from pycrorm_async.events.types import (
     RobotValue,
     SeenValue,
 )
+from pycrorm_async.record.declarations import DeclaredType
 from pycrorm_async.record.episode_writer import (
-    THREAD_NAME_PREFIX,
     Emitter,
     EpisodeOpening,
     EpisodeWriter,
     Failures,
     OpenEpisodes,
     end_statuses,
+    is_of_memory,
     put_observation,
 )
+from pycrorm_async.record.geometry import mass_of, urdf_of
 from pycrorm_async.record.objects import RecordedObject, RecordedObjects
-from pycrorm_async.record.parameters import DeclaredType
 from pycrorm_async.record.values import (
     MissingValues,
-    References,
+    PoseLike,
     RefusedValue,
-    UnrecordableValue,
     clean,
     clean_repr,
     encode_or_missing,
-    encode_parameter,
     failure_value,
     message_of,
     missing_value,
+    pose_value,
+    read_parameters,
     reading_fault,
+    recorded_as,
 )
-from pycrorm_async.world.model_boxes import described_mass_kg
-from pycrorm_async.world.pose import DescriptionNotLoadable, Pose
-from pycrorm_async.world.urdf_model import urdf_text
 
 # === ordered calls ============================================================================================
 #
-# `OrderedCalls` runs the calls of one episode one after the other, whichever threads make them.
+# `OrderedCalls` runs the calls of one memory one after the other, whichever threads make them.
 #
-# Theory of operation. A thread runs its call under the lock of the episode, so its call has run when it returns. It
-# must not wait for a lock if it runs a call of any episode already, because the garbage collector, or a method of a
-# key, may have made the call in the middle of another one, and two episodes could wait for each other: such a call is
-# left in `_this_thread.left`, and the thread runs it after that other one. A thread of the memory must not wait either,
-# because the holder of the lock may wait for the room in the spool that this thread makes: it takes the lock only if it
-# is free, and otherwise leaves the call in `_left` to the holder.
+# Theory of operation. A call is put into `_left`, and a thread that holds the lock runs what is left there in order. An
+# ordinary thread waits for the lock, so its call has run when it returns. The garbage collector, or a method of a key,
+# may make a call in the middle of another one, in the thread that holds the lock: the lock is reentrant, `_is_running`
+# shows this, and the outer call's thread runs the inner one afterwards. A thread of the memory does not wait, because
+# the holder of the lock may wait for the room in the spool that this thread makes: it leaves the call to the holder.
 #
 # A signal handler may raise KeyboardInterrupt in the main thread when any call returns. `with` on the lock itself
 # cannot be interrupted between taking the lock and entering the block, nor before the lock is released; `acquire` and
@@ -84,105 +79,63 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _ThreadState(threading.local):
-    """The state of one thread: busy with a call, the calls left to run after it, and if it is one of the memory."""
-
-    def __init__(self) -> None:
-        self.is_busy = False
-        self.left: deque[tuple[OrderedCalls, Callable[[], object]]] = deque()
-        self.is_of_memory = threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
-
-
-_this_thread = _ThreadState()
-
-
-def may_wait() -> bool:
-    """Return whether this thread may wait for room in the spool: it runs no call, and does not make room itself."""
-    return not _this_thread.is_busy and not _this_thread.is_of_memory
-
-
 class OrderedCalls:
-    """The calls of one episode."""
+    """The calls of one memory."""
 
     def __init__(self) -> None:
         self._left: deque[Callable[[], object]] = deque()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._is_running = False
 
     def run(self, call: Callable[[], object]) -> None:
         """Run a call, which must not raise, after all earlier ones."""
-        thread = _this_thread
-        if thread.is_of_memory:
-            self._left.append(call)
-            self._run_if_free()
-            return
-        if thread.is_busy:
-            thread.left.append((self, call))
-            return
-        thread.is_busy = True  # followed by `try` without a call, so that Ctrl-C cannot separate the two
-        try:
-            self._run(call)
-            _run_left(thread)
-        finally:
-            thread.is_busy = False
-
-    def _run(self, call: Callable[[], object]) -> None:
-        with self._lock:
-            if self._left:
-                self._drain()
-            call()
-        while self._left:  # a thread of the memory came before the lock was released
-            with self._lock:
-                self._drain()
-
-    def _run_if_free(self) -> None:
-        while self._left and self._lock.acquire(blocking=False):
-            try:
-                self._drain()
-            finally:
-                self._lock.release()
+        self._left.append(call)
+        if is_of_memory():
+            while self._left and self._lock.acquire(blocking=False):
+                try:
+                    self._drain()
+                finally:
+                    self._lock.release()
+        else:
+            while self._left:  # once more if a thread of the memory came before the lock was released
+                with self._lock:
+                    if self._is_running:  # in a call that this thread runs, which is followed by this one
+                        return
+                    self._drain()
 
     def _drain(self) -> None:
+        self._is_running = True  # followed by `try` without a call, so that Ctrl-C cannot separate the two
+        try:
+            self._run_left()
+        finally:
+            self._is_running = False
+
+    def _run_left(self) -> None:
         while self._left:
             self._left.popleft()()
 
 
-def _run_left(thread: _ThreadState) -> None:
-    while thread.left:
-        calls, each = thread.left.popleft()
-        calls._run(each)  # noqa: SLF001  of this module
+def reported(
+    event_type: str,
+) -> Callable[
+    [Callable[Concatenate[RecordedEpisode, P], Callable[[], object]]], Callable[Concatenate[RecordedEpisode, P], None]
+]:
+    """Make a method that copies its arguments, and returns the call that writes them, one that writes and never raises.
 
-
-class CountingEpisode(Protocol):
-    """An episode whose methods never raise."""
-
-    @property
-    def emitter(self) -> Emitter:
-        """Counts the faults."""
-        ...
-
-
-E = TypeVar("E", bound=CountingEpisode)
-
-
-def counted(event_type: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Concatenate[E, P], R | None]]:
-    """Count the exceptions of a method; only count it if the memory is closed or belongs to a parent process.
-
-    The memory has ended what was open then, so an end is not missed.
+    Its exceptions are counted. If the memory is closed or belongs to a parent process, only the call is counted; the
+    memory has ended what was open then, so an end is not missed.
     """
 
-    def wrap(method: Callable[Concatenate[E, P], R]) -> Callable[Concatenate[E, P], R | None]:
+    def wrap(
+        method: Callable[Concatenate[RecordedEpisode, P], Callable[[], object]],
+    ) -> Callable[Concatenate[RecordedEpisode, P], None]:
         @functools.wraps(method)
-        def run(self: E, /, *args: P.args, **kwargs: P.kwargs) -> R | None:
-            emitter = self.emitter
-            if emitter.is_closed:
-                if event_type not in ("NodeEnded", "EpisodeEnded", "EpisodeStarted"):
-                    emitter.note_unrecorded(f"a call of `{method.__name__}`")
-                return None
-            try:
-                return method(self, *args, **kwargs)
-            except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-                emitter.note_fault(event_type, error)
-                return None
+        def run(self: RecordedEpisode, /, *args: P.args, **kwargs: P.kwargs) -> None:
+            if self.is_recording(method.__name__, event_type):
+                try:
+                    self.write(event_type, method(self, *args, **kwargs))
+                except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+                    self.emitter.note_fault(event_type, error)
 
         return run
 
@@ -210,6 +163,8 @@ FOREVER_S = 1e8
 """The seconds that a start waits for room: three years, because a wait takes a number."""
 FailureCause: TypeAlias = BaseException | FailureValue | tuple[str, str] | str
 """A failure as an executive gives it: an exception, a pair of reason and message, or a text."""
+Convert: TypeAlias = Callable[[Any], Any]
+END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
 
@@ -231,7 +186,7 @@ class _Node:
         self.episode: RecordedEpisode | None = None
 
 
-class RecordedEpisode(EpisodeWriter[_Node]):
+class RecordedEpisode(EpisodeWriter):
     """An episode of any executive, from any thread; `Recording.episode` makes it.
 
     >>> with recording.episode(description="Tutorial") as episode:
@@ -247,6 +202,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         self,
         emitter: Emitter,
         episodes: OpenEpisodes,
+        calls: OrderedCalls,
         opening: EpisodeOpening,
         convert: Convert | None,
         failures: Failures = (),
@@ -254,12 +210,12 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         super().__init__(emitter, episodes.new_id(), opening)
         self._episodes = episodes
         self._failures = failures
-        self._calls = OrderedCalls()
+        self._calls = calls
         self._end_status: EpisodeStatus | None = None
         self._nodes: dict[Hashable, _Node] = {}
         self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
-        self._objects = RecordedObjects(emitter, self.id)
-        self._values = RecordedValues(convert, self._objects, self)
+        self._objects = RecordedObjects(self)
+        self._values = RecordedValues(convert, self._objects)
         self._arguments = ArgumentReader(emitter.missing)
 
     def __enter__(self) -> Self:
@@ -280,22 +236,30 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             self._end_status = status
         self._episodes.close(self, failure)
 
-    def _write(self, event_type: str, write: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call `write` after all earlier calls."""
-        self._calls.run(partial(self._written, event_type, write, *args, **kwargs))
+    def is_recording(self, method: str, event_type: str) -> bool:
+        """Return whether the memory is open; otherwise count a call of this method, unless it ends something."""
+        if not self.emitter.is_closed:
+            return True
+        if event_type not in ("NodeEnded", "EpisodeEnded", "EpisodeStarted"):
+            self.emitter.note_unrecorded(f"a call of `{method}`")
+        return False
 
-    def _written(self, event_type: str, write: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
-        if self.closed:
-            self._note(event_type, f"episode {self} has ended")
-            return
-        try:  # not `noted`, because this is called for each event
-            write(*args, **kwargs)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self.emitter.note_fault(event_type, error)
+    def write(self, event_type: str, write: Callable[[], object]) -> None:
+        """Call `write` after all earlier calls, unless the episode has ended; count its exceptions."""
+
+        def run() -> None:
+            if self.closed:
+                self._note(event_type, f"episode {self} has ended")
+                return
+            try:  # not `noted`, because this is called for each event
+                write()
+            except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+                self.emitter.note_fault(event_type, error)
+
+        self._calls.run(run)
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
-    @counted("NodeStarted")
     def start(
         self,
         key: Hashable,
@@ -319,26 +283,31 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             parent: key of the node it runs inside. One that never started is counted, and the root takes its place.
             robot: the state of the robot that acts, or the key of its object.
         """
+        if not self.is_recording("start", "NodeStarted"):
+            return None
+        return noted(self.emitter, "NodeStarted", self._start, key, type, parameters, parent, robot)
+
+    def _start(
+        self, key: Hashable, declared: DeclaredType, given: Mapping[str, Any], parent: Hashable | None, robot: object
+    ) -> _Node:
         hash(key)
-        if self.emitter.must_wait() and may_wait():
+        if self.emitter.must_wait() and not is_of_memory():
             self.emitter.sink.block_until_room(FOREVER_S, reserved=False)
         missing: dict[str, str] = {}
-        values = noted(self.emitter, "NodeStarted", self._values.parameters, type, parameters, missing) or {}
-        node = _Node(key, type, values)
-        self._write("NodeStarted", self._start_node, node, parent, robot, missing)
+        parameters = noted(self.emitter, "NodeStarted", self._values.parameters, declared, given, self, missing) or {}
+        node = _Node(key, declared, parameters)
+        self.write("NodeStarted", lambda: self._start_node(node, parent, robot, missing))
         return node
 
     def _start_node(self, node: _Node, parent: Hashable | None, robot: object, missing: dict[str, str]) -> None:
         key = node.key
         if key in self._nodes:
             self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
-            self._end_node(self._nodes[key], NodeEnded(self._nodes[key].sequence, "LOST"))
+            self._end_node(self._nodes[key], "LOST")
         node.parent = self._find(parent, "NodeStarted")
         declared, acting = node.declared, noted(self.emitter, "NodeStarted", self._robot, robot)
-        node.sequence = self._put_start(
-            node, declared, declared.declaration.kind, self.node_or_root(node.parent), node.parameters, acting,
-            missing=missing, may_refuse=False,
-        )  # fmt: skip
+        above = self.node_or_root(node.parent)
+        node.sequence = self.put_start(declared, declared.declaration.kind, above, node.parameters, acting, missing)
         node.episode = self
         self._nodes[key] = node
         self._ended.pop(key, None)
@@ -353,7 +322,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
         return acting
 
-    @counted("NodeEnded")
+    @reported("NodeEnded")
     def end(
         self,
         key: Hashable,
@@ -362,7 +331,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         result: Any = None,
         *,
         below: NodeStatus | None = None,
-    ) -> None:
+    ) -> Callable[[], object]:
         """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR.
 
         >>> episode.end("drive", failure=("WheelSlipped", "the left wheel turned 3 rad without moving"))
@@ -381,10 +350,10 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         if status is None:
             raised = failure if isinstance(failure, BaseException) else None
             status = end_statuses(raised, self._failures)[1] if raised is failure else "FAILED"
-        status, below = self._checked_status(status), self._checked_status(below) if below is not None else None
-        value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
-        encoded = self._values.any(result) if result is not None else None
-        self._write("NodeEnded", self._end_open, key, status, value, encoded, below)
+        own, lower = self._checked_status(status), self._checked_status(below) if below is not None else None
+        value = noted(self.emitter, "NodeEnded", self._values.failure, failure, self) if failure is not None else None
+        encoded = encode_or_missing(self._values.converted(result), self) if result is not None else None
+        return lambda: self._end_open(key, own, value, encoded, lower)
 
     def _checked_status(self, status: NodeStatus) -> NodeStatus:
         if status in END_STATUSES:
@@ -400,15 +369,17 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             raise CallerError(f"no open node has the key {clean_repr(key)}")
         if below is not None:
             for each in [each for each in reversed(self._nodes.values()) if _is_below(each, node)]:
-                self._end_node(each, NodeEnded(each.sequence, below))
+                self._end_node(each, below)
         if failure is not None and failure.type == UNNAMED:
             parameters = (each for each in node.parameters.values() if isinstance(each, str))
             template = template_of(failure.message, (*parameters, *self._objects.names()))
             failure = replace(failure, type=template or UNNAMED)
-        self._end_node(node, NodeEnded(node.sequence, status, failure, result))
+        self._end_node(node, status, failure, result)
 
-    def _end_node(self, node: _Node, event: NodeEnded) -> None:
-        self._close_node(event, node.declared.dtype)
+    def _end_node(
+        self, node: _Node, status: NodeStatus, failure: FailureValue | None = None, result: Any = None
+    ) -> None:
+        self.put_end(node.sequence, status, failure, result)
         self._nodes.pop(node.key, None)
         node.parameters = {}
         while node.parent is not None and self._nodes.get(node.parent.key) is not node.parent:
@@ -435,13 +406,13 @@ class RecordedEpisode(EpisodeWriter[_Node]):
 
     # --- objects ----------------------------------------------------------------------------------------------
 
-    @counted("ObjectAdded")
+    @reported("ObjectAdded")
     def object_added(
         self,
         key: Hashable,
         name: str,
         object_type: str | Enum,
-        pose: Pose | PoseValue,
+        pose: PoseLike | PoseValue,
         joints: Mapping[str, float] = {},
         *,
         urdf: str | PathLike[str] | None = None,
@@ -452,7 +423,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         base_link: str | None = None,
         torso_joint: str | None = None,
         node: Hashable | None = None,
-    ) -> None:
+    ) -> Callable[[], object]:
         """Record that an object entered the world; for a known key, record its new pose and joints.
 
         Args:
@@ -469,47 +440,53 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
             base_link=base_link, torso_joint=torso_joint,
         )  # fmt: skip
-        self._write("ObjectAdded", lambda: self._objects.add(key, added, self._cause(node)))
+        return lambda: self._objects.add(key, added, self._cause(node))
 
-    @counted("ObjectMoved")
-    def object_moved(self, key: Hashable, pose: Pose | PoseValue, *, node: Hashable | None = None) -> None:
+    @reported("ObjectMoved")
+    def object_moved(
+        self, key: Hashable, pose: PoseLike | PoseValue, *, node: Hashable | None = None
+    ) -> Callable[[], object]:
         """Record the new pose of an object, unless it is the same."""
         if not self.closed and self._objects.is_at(key, pose):
-            return  # before the pose is copied, which takes longer
+            return lambda: None  # before the pose is copied, which takes longer
         copied = pose_of(pose)
-        self._write("ObjectMoved", lambda: self._objects.move(self._known(key), copied, self._cause(node)))
+        return lambda: self._objects.move(self._known(key), copied, self._cause(node))
 
-    @counted("JointsMoved")
-    def joints_moved(self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None) -> None:
+    @reported("JointsMoved")
+    def joints_moved(
+        self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None
+    ) -> Callable[[], object]:
         """Record new joint positions (rad or m); only those that changed."""
         copied = self._arguments.joints_of(joints)
-        self._write("JointsMoved", lambda: self._objects.turn(self._known(key), copied, self._cause(node)))
+        return lambda: self._objects.turn(self._known(key), copied, self._cause(node))
 
-    @counted("ObjectAttached")
+    @reported("ObjectAttached")
     def object_attached(
         self, parent: Hashable, child: Hashable, link: str | None = None, *, node: Hashable | None = None
-    ) -> None:
+    ) -> Callable[[], object]:
         """Record that `child` moves with `link` of `parent` from now on."""
         name = self._arguments.text_of("link", link)
 
         def write() -> int:
             return self._objects.attach(self._known(parent), self._known(child), name, self._cause(node))
 
-        self._write("ObjectAttached", write)
+        return write
 
-    @counted("ObjectDetached")
-    def object_detached(self, parent: Hashable, child: Hashable, *, node: Hashable | None = None) -> None:
+    @reported("ObjectDetached")
+    def object_detached(
+        self, parent: Hashable, child: Hashable, *, node: Hashable | None = None
+    ) -> Callable[[], object]:
         """Record that `child` no longer moves with `parent`."""
 
         def write() -> int:
             return self._objects.detach(self._known(parent), self._known(child), self._cause(node))
 
-        self._write("ObjectDetached", write)
+        return write
 
-    @counted("ObjectRemoved")
-    def object_removed(self, key: Hashable, *, node: Hashable | None = None) -> None:
+    @reported("ObjectRemoved")
+    def object_removed(self, key: Hashable, *, node: Hashable | None = None) -> Callable[[], object]:
         """Record that an object left the world."""
-        self._write("ObjectRemoved", lambda: self._objects.remove(self._known(key), self._cause(node)))
+        return lambda: self._objects.remove(self._known(key), self._cause(node))
 
     def reference(self, key: Hashable) -> ObjectReference | None:
         """Return the current row of an object, for values that name it; None if there is none of this key.
@@ -520,18 +497,18 @@ class RecordedEpisode(EpisodeWriter[_Node]):
 
     # --- observations -----------------------------------------------------------------------------------------
 
-    @counted("Observed")
-    def observe(self, name: str, values: object, *, node: Hashable | None = None) -> None:
+    @reported("Observed")
+    def observe(self, name: str, values: object, *, node: Hashable | None = None) -> Callable[[], object]:
         """Record an observation, as `Memory.observe` does."""
         copied = self._values.converted(values)
 
         def write() -> int:
             observer = self.node_or_root(self._find(node, "Observed"))
-            return put_observation(self.emitter, self, name, copied, observer, may_refuse=False)
+            return put_observation(self, name, copied, observer, may_refuse=False)
 
-        self._write("Observed", write)
+        return write
 
-    @counted("ObjectDetected")
+    @reported("ObjectDetected")
     def detected(
         self,
         seen: Sequence[SeenValue],
@@ -539,7 +516,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         source: Literal["camera", "world_state"] = "camera",
         object_type: str | None = None,
         node: Hashable | None = None,
-    ) -> None:
+    ) -> Callable[[], object]:
         """Record a result of perception; `object_type` is the type searched for."""
         copied = (noted(self.emitter, "ObjectDetected", struct_of, each, SeenValue) for each in seen)
         percepts = [each for each in copied if each is not None]
@@ -549,30 +526,27 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             acting = self._find(node, "ObjectDetected")
             number = self.node_or_root(acting) if acting is not None else None
             held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
-            return self._put_detection(replace(event, seen=tuple(held), node=number))
+            return self.put(replace(event, seen=tuple(held), node=number))
 
-        self._write("ObjectDetected", write)
+        return write
 
-    @counted("EpisodeTagged")
-    def tag(self, *tags: str, remove: Sequence[str] = ()) -> None:
+    @reported("EpisodeTagged")
+    def tag(self, *tags: str, remove: Sequence[str] = ()) -> Callable[[], object]:
         """Add and remove tags."""
         added, removed = checked_tags(tags), checked_tags(remove)
 
-        def write() -> int:
-            EpisodeWriter.change_tags(self, added, removed)
-            return 0
+        return lambda: EpisodeWriter.change_tags(self, added, removed)
 
-        self._write("EpisodeTagged", write)
-
-    @counted("EpisodeStarted")
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
         """Block while the spool is full, for a limited time; return whether it has room now.
 
         `start` waits by itself, without a limit; so this is for an executive that has something else to do then.
         """
-        sink = self.emitter.sink
-        has_room = not sink.full or sink.block_until_room(FOREVER_S if timeout_s is None else timeout_s, reserved=False)
-        return has_room and not self.emitter.is_closed
+        sink, limit_s = self.emitter.sink, FOREVER_S if timeout_s is None else timeout_s
+        has_room = not sink.full or noted(
+            self.emitter, "EpisodeStarted", sink.block_until_room, limit_s, reserved=False
+        )
+        return bool(has_room) and not self.emitter.is_closed
 
     # --- the writer's part ------------------------------------------------------------------------------------
 
@@ -589,14 +563,14 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             self._episodes.by_id.pop(self.id, None)
             self.closed = True
 
-    def end_episode(self, failure: BaseException | None) -> None:
+    def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
         """Write the end of the episode."""
-        self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure))
+        self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure, world))
 
-    def _end_now(self, failure: BaseException | None) -> None:
-        if (left := len(self._open_nodes)) and failure is None and not self.closed:
+    def _end_now(self, failure: BaseException | None, world: str | None) -> None:
+        if (left := len(self._nodes)) and failure is None and not self.closed:
             self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {left}")
-        super().end_episode(failure)
+        super().end_episode(failure, world)
         self._nodes.clear()
         self._ended.clear()
 
@@ -619,12 +593,6 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         if status is None:
             return end_statuses(failure, self._failures)
         return status, ("CANCELLED" if status == "INTERRUPTED" else status)
-
-    def _leave_world(self) -> None:
-        """Do nothing: the executive reports the objects, so no observer has to stop."""
-
-    def _described_world(self) -> str | None:
-        return None
 
     def _find(self, key: Hashable | None, event_type: str) -> _Node | None:
         """Return the node of a key, or of a value that `start` returned; count a key that no node has."""
@@ -663,7 +631,6 @@ def _is_below(node: _Node, ancestor: _Node) -> bool:
 # A wrong value raises `CallerError` if it is required (a pose); an optional one (a colour, one joint) is counted as
 # missing.
 
-END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
 _INTEGERS = range(-(2**63), 2**63)
 _UNIT_TOLERANCE = 1e-6
 """A quaternion whose length differs from 1 by less keeps its bits: it is that of an executive in single precision."""
@@ -693,12 +660,9 @@ def _with_unit_turn(value: S) -> S:
     return value
 
 
-def pose_of(pose: Pose | PoseValue) -> PoseValue:
+def pose_of(pose: PoseLike | PoseValue) -> PoseValue:
     """Copy a pose. Raises `CallerError`, also for a number that is not finite."""
-    if isinstance(pose, Pose):
-        value = PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
-    else:
-        value = struct_of(pose, PoseValue)
+    value = struct_of(pose, PoseValue) if recorded_as(type(pose)) is None else pose_value(cast("PoseLike", pose))
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
         raise CallerError(f"the pose holds a number that is not finite: {clean_repr(pose)}")
     if value.time_ns not in _INTEGERS:
@@ -721,13 +685,13 @@ class ArgumentReader:
         self._missing = missing
 
     def object_of(
-        self, name: str, object_type: str | Enum, pose: Pose | PoseValue, joints: Mapping[str, float], **others: Any
+        self, name: str, object_type: str | Enum, pose: PoseLike | PoseValue, joints: Mapping[str, float], **others: Any
     ) -> RecordedObject:
         """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
-        urdf, kind = self._urdf_of(name, others["urdf"]), self.text_of("object_type", object_type) or "UNKNOWN"
+        urdf, kind = urdf_of(name, others["urdf"], self._missing), self.text_of("object_type", object_type) or "UNKNOWN"
         mass_kg = self._number_of("mass_kg", others["mass_kg"])
-        if mass_kg is None and urdf is not None and kind not in ("ROBOT", "ENVIRONMENT"):  # as `Object.mass_kg`
-            mass_kg = described_mass_kg(urdf)
+        if mass_kg is None:
+            mass_kg = mass_of(urdf, kind)
         texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
         return RecordedObject(
             self.text_of("name", name) or "an object",
@@ -739,21 +703,6 @@ class ArgumentReader:
             mass_kg=mass_kg,
             **texts,
         )
-
-    def _urdf_of(self, name: str, urdf: Any) -> str | None:
-        """Return the text of a URDF with the paths of its meshes, as a world reads it; faults are counted as missing.
-
-        The text is kept where a world would refuse it, because an executive may have loaded it elsewhere.
-        """
-        text = urdf if isinstance(urdf, str) and urdf.lstrip().startswith("<") else None
-        if urdf is None or (text is not None and "<mesh" not in text):
-            return text
-        try:
-            return urdf_text(name, text or Path(urdf))
-        except (DescriptionNotLoadable, TypeError) as error:
-            if text is None:  # declaring a text counts the mesh that does not exist, or the fault of the XML
-                self._missing.note("ObjectAdded", "urdf", f"{clean_repr(urdf)}: {message_of(error)}")
-            return text
 
     def text_of(self, argument: str, text: object) -> str | None:
         """Copy a text; of an enum its member's name, of another value its shortened repr."""
@@ -808,52 +757,32 @@ class ArgumentReader:
 #
 # Copy the values of an executive, through its own conversion, into values of events.
 
-Convert = Callable[[Any], Any]
-
-
-class _Objects(Protocol):
-    def reference(self, key: Hashable) -> ObjectReference | None: ...
-
-    def holds(self, reference: ObjectReference | None) -> bool: ...
-
 
 class RecordedValues:
     """Converts values for one episode. `convert` is the executive's; it is called with each value and each item."""
 
-    def __init__(self, convert: Convert | None, objects: _Objects, references: References) -> None:
+    def __init__(self, convert: Convert | None, objects: RecordedObjects) -> None:
         self._convert = convert
         self._objects = objects
-        self._references = references
 
-    def parameters(self, declared: DeclaredType, values: Mapping[Any, Any], missing: dict[str, str]) -> dict[str, Any]:
+    def parameters(
+        self, declared: DeclaredType, given: Mapping[Any, Any], episode: RecordedEpisode, missing: dict[str, str]
+    ) -> dict[str, Any]:
         """Return the parameters by field name; add to `missing` the reason for each that becomes a `MissingValue`."""
-        parameters: dict[str, Any] = {}
-        undeclared = dict(values)
-        for field, path, enum in declared.fields:
-            value = undeclared.pop(path[0], None)
-            if value is None:
-                continue
-            try:
-                converted = self.converted(value, as_object="object" in (field.type, field.item))
-                if converted is not None:
-                    parameters[field.name] = encode_parameter(field, enum, converted, self._references)
-            except UnrecordableValue as refusal:
-                missing[field.name] = str(refusal)
-                parameters[field.name] = missing_value(str(refusal), value)
-            except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
-                missing[field.name] = fault = reading_fault(error)
-                parameters[field.name] = missing_value(fault, value)
-        for name, value in undeclared.items():
+        source: dict[Any, Any] = {}
+        left = dict(given)
+        for field in declared.fields:
+            key = field.path[0]
+            value = left.pop(key, None)
             if value is not None:
-                reasons = {each.path[0]: each.reason for each in declared.undeclared}
+                source[key] = self.converted(value, as_object=field.is_object)
+        parameters = read_parameters(source, declared.fields, episode, missing)
+        for name, value in left.items():
+            if value is not None:
                 text = clean(name) if isinstance(name, str) else clean_repr(name)
-                missing[text] = reason = reasons.get(name, f"{declared.dtype} was declared without this field")
+                missing[text] = reason = f"{declared.dtype} was declared without this field"
                 parameters[text] = missing_value(reason, value)
         return parameters
-
-    def any(self, value: Any) -> Any:
-        """Return a JSON value, or a `MissingValue`. Never raises."""
-        return encode_or_missing(self.converted(value), self._references)
 
     def converted(self, value: Any, *, as_object: bool = False) -> Any:
         """Return the value as the executive converts it; a `RefusedValue` with the reason if it cannot convert it.
@@ -876,16 +805,16 @@ class RecordedValues:
             try:
                 value = self._convert(value)
             except Exception as error:  # noqa: BLE001  an executive's conversion may raise anything
-                return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error))
+                return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error), value)
             if as_object and (reference := self._known_object(value)) is not None:
                 return reference
         return self._checked(value) if isinstance(value, msgspec.Struct) else value
 
-    def failure(self, failure: object) -> FailureValue:
+    def failure(self, failure: object, episode: RecordedEpisode) -> FailureValue:
         """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
         match failure:
             case BaseException():
-                return failure_value(failure, self._references, self.converted)
+                return failure_value(failure, episode, self.converted)
             case (str(), str()) | str():
                 reason, message = (UNNAMED, failure) if isinstance(failure, str) else failure
                 return FailureValue(clean(reason), clean(message))
@@ -898,10 +827,10 @@ class RecordedValues:
                 return pose_of(value)
             whole = struct_of(value, type(value))
         except CallerError as error:
-            return RefusedValue(message_of(error))
+            return RefusedValue(message_of(error), value)
         reference = whole.part_of if isinstance(whole, ObjectValue) else whole
         if isinstance(reference, ObjectReference) and not self._objects.holds(reference):
-            return RefusedValue("it refers to a row that this episode does not have")
+            return RefusedValue("it refers to a row that this episode does not have", value)
         if isinstance(whole, ObjectValue) and whole.pose is not None:
             return self._checked(whole.pose) if isinstance(self._checked(whole.pose), RefusedValue) else whole
         return whole
@@ -909,5 +838,5 @@ class RecordedValues:
     def _known_object(self, value: Any) -> ObjectReference | None:
         try:
             return self._objects.reference(value)
-        except TypeError:  # it is not hashable, so it is no key
+        except Exception:  # noqa: BLE001  it is not hashable, so it is no key
             return None

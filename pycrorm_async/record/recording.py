@@ -12,25 +12,26 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, parse_episode_id
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeReference
 from pycrorm_async.record.declarations import (
+    Declared,
+    DeclaredType,
     FieldSpec,
     KnownTypes,
-    PreparedType,
     RecordedKind,
-    declare_prepared,
-    declare_type,
-    prepare_type,
+    declare_named,
+    without_type,
 )
 from pycrorm_async.record.episode_writer import (
+    NO_LABELS,
     Emitter,
     EpisodeOpening,
     Failures,
+    Labels,
     OpenEpisodes,
     Provenance,
     check_arguments,
     read_labels,
 )
-from pycrorm_async.record.parameters import DeclaredType
-from pycrorm_async.record.recorded_episode import Convert, RecordedEpisode
+from pycrorm_async.record.recorded_episode import Convert, OrderedCalls, RecordedEpisode
 from pycrorm_async.record.values import clean_repr
 
 _TYPES_MAX = 10_000
@@ -44,7 +45,9 @@ _Arguments: TypeAlias = tuple[
 
 
 class Recording:
-    """Writes the episodes of an executive that is not ours; `Memory.recording` and `SyncMemory.recording`.
+    """Writes the episodes of any executive; `Memory.recording` and `SyncMemory.recording`.
+
+    The hooks of our own plan layer (`plan_recorder`) open their episodes and declare their types here too.
 
     >>> navigate = recording.type("action", "NavigateAction", {"target_location": "pose"})
     >>> with recording.episode(description="Tutorial") as episode:
@@ -67,13 +70,14 @@ class Recording:
         software: str,
         provenance: Provenance | None = None,
     ) -> None:
-        self._emitter = emitter
-        self._episodes = episodes
-        self._known_types = known_types
+        self.emitter = emitter
+        self.episodes = episodes
+        self.known_types = known_types
         self._software = software
         self._provenance = provenance
+        self._calls = OrderedCalls()
         self._types: dict[_Arguments, DeclaredType] = {}
-        self._prepared: dict[_Arguments, PreparedType] = {}
+        self._prepared: dict[_Arguments, tuple[Declared, tuple[str | None, int]]] = {}
         self._lock = threading.RLock()
         for each in stored:
             known_types.note_stored(each)
@@ -107,7 +111,7 @@ class Recording:
         try:
             cached = _arguments(kind, dtype, fields, bases, concept, aliases)
             declared = self._types.get(cached)
-            if declared is None and not self._emitter.is_closed:  # before the lock, which may be held since a fork
+            if declared is None and not self.emitter.is_closed:  # before the lock, which may be held since a fork
                 with self._lock:
                     if len(self._types) >= _TYPES_MAX:
                         self._types.clear()
@@ -115,7 +119,7 @@ class Recording:
                     self._types[cached] = declared
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             declared = None
-            self._emitter.note_fault("DesignatorTypeDeclared", error)
+            self.emitter.note_fault("DesignatorTypeDeclared", error)
         return declared or _undeclared(kind, dtype)
 
     def prepare(
@@ -126,11 +130,14 @@ class Recording:
         Nothing is declared, so a type that is never asked for has no table and reserves no name. Raises nothing.
         """
         try:
-            prepared = prepare_type(kind, dtype, fields, self._known_types, bases=bases)
-            if prepared is not None and len(self._prepared) < _TYPES_MAX:
-                self._prepared[_arguments(kind, dtype, fields, bases)] = prepared
+            table = self.known_types.table_of(dtype)
+            declared = declare_named(kind, dtype, fields, self.known_types.copy_of(table), bases=bases)
+            # One with another name depends on other tables than its own.
+            if declared.dtype is None and declared.type.payload and len(self._prepared) < _TYPES_MAX:
+                state = self.known_types.state_of(table)
+                self._prepared[_arguments(kind, dtype, fields, bases)] = declared, state
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("DesignatorTypeDeclared", error)
+            self.emitter.note_fault("DesignatorTypeDeclared", error)
 
     def _declare(
         self,
@@ -143,24 +150,21 @@ class Recording:
     ) -> DeclaredType:
         if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
             raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
-        prepared = self._prepared.pop((kind, dtype, fields, bases, concept, aliases), None)
-        recorded = declare_prepared(prepared, self._known_types) if prepared is not None else None
-        if recorded is None:
-            recorded = declare_type(
-                kind, dtype, dict(fields), self._known_types, bases=bases, concept=concept, aliases=aliases
-            )
-        declared, missing = recorded.type, self._emitter.missing
-        for name, renamed in recorded.fields.items():
-            missing.note_renamed(declared.dtype, name, *renamed)
-        for each in declared.undeclared:
-            missing.note(declared.dtype, each.name, each.reason)
-        if recorded.dtype is not None:
-            missing.note_renamed(declared.dtype, "type", *recorded.dtype)
-        if declared.fault is not None:
-            missing.note(declared.dtype, "type", declared.fault)
-        if declared.payload:
-            self._emitter.put_declaration(declared)
-        return declared
+        declared, state = self._prepared.pop((kind, dtype, fields, bases, concept, aliases), (None, None))
+        known = self.known_types
+        if declared is not None and known.state_of(declared.type.declaration.table) == state:
+            if (built_in := known.built_in(dtype)) is not None:
+                known.note_stored(built_in)
+            known.note(declared.type.declaration)
+        else:
+            declared = declare_named(kind, dtype, dict(fields), known, bases=bases, concept=concept, aliases=aliases)
+        own, missing = declared.type, self.emitter.missing
+        for name, reason in own.undeclared.items():
+            missing.note(own.dtype, name, reason)
+        if own.fault is not None:
+            missing.note(own.dtype, "type", own.fault)
+        self.emitter.put_declaration(declared)
+        return own
 
     def episode(
         self,
@@ -193,10 +197,6 @@ class Recording:
             CallerError: an argument has the wrong type. Any other fault is counted, and the episode stays empty.
         """
         text = description or plan or "an episode"
-        check_arguments(description=text, plan=plan, seed=seed, strict=False)
-        check_arguments(description=world, plan=None, seed=None, strict=False)
-        if thought_by is not None and not _is_whole(thought_by):
-            raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
         unchecked: tuple[object, object, object] = (simulated, seed, failures)  # as the caller passed them
         if not isinstance(unchecked[0], bool) or isinstance(unchecked[1], bool):
             raise CallerError("simulated must be a bool, and seed an int")
@@ -204,27 +204,49 @@ class Recording:
             raise CallerError(f"convert must be a function, not {convert!r:.100}")
         if not isinstance(unchecked[2], tuple) or not all(isinstance(each, builtins.type) for each in unchecked[2]):
             raise CallerError(f"failures must be a tuple of classes of exceptions, not {failures!r:.100}")
-        opening = EpisodeOpening(
+        opening = self.opening(
             text,
-            self._software,
-            plan,
-            seed,
-            world,
+            plan=plan,
+            seed=seed,
+            labels=read_labels(tags, metadata, self.emitter),
+            world=world,
             simulated=simulated,
             thought_by=thought_by,
-            provenance=self._provenance,
-            labels=read_labels(tags, metadata, self._emitter),
         )
-        episode = RecordedEpisode(self._emitter, self._episodes, opening, convert, failures)
-        if self._emitter.is_closed:
-            self._emitter.note_unrecorded(f"the episode {text!r}")
+        episode = RecordedEpisode(self.emitter, self.episodes, self._calls, opening, convert, failures)
+        if self.emitter.is_closed:
+            self.emitter.note_unrecorded(f"the episode {text!r}")
         else:
             episode.open()
         return episode
 
+    def opening(
+        self,
+        description: str,
+        *,
+        plan: str | None = None,
+        seed: int | None = None,
+        labels: Labels = NO_LABELS,
+        world: str | None = None,
+        simulated: bool = False,
+        thought_by: NodeReference | None = None,
+        strict: bool = False,
+    ) -> EpisodeOpening:
+        """Check the arguments of an episode. With `strict`, a text that is too long is refused, and not cut.
+
+        Raises `CallerError`.
+        """
+        check_arguments(description=description, plan=plan, seed=seed, strict=strict)
+        check_arguments(description=world, plan=None, seed=None, strict=False)
+        if thought_by is not None and not _is_whole(thought_by):
+            raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
+        return EpisodeOpening(
+            description, self._software, plan, seed, world, simulated, thought_by, self._provenance, labels
+        )
+
     def note_fault(self, where: str, error: BaseException) -> None:
         """Count a fault of an integration in `Memory.status`, and log it now and then. Raises nothing."""
-        self._emitter.note_fault(where, error)
+        self.emitter.note_fault(where, error)
 
 
 def _arguments(
@@ -251,9 +273,7 @@ def _undeclared(kind: object, dtype: object) -> DeclaredType:
     valid: RecordedKind = "action"
     if isinstance(kind, str) and kind in get_args(RecordedKind):
         valid = cast("RecordedKind", kind)
-    name = clean_repr(dtype)
-    reason = "its type could not be declared"
-    return DeclaredType(name, b"", "", (), DesignatorTypeDeclared(kind=valid, dtype=name, table=""), (), reason)
+    return without_type(valid, clean_repr(dtype), "its type could not be declared")
 
 
 # === episode block ============================================================================================

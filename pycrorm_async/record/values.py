@@ -1,11 +1,14 @@
-"""Copy live values of a plan into frozen event values at the moment a hook observes them.
+"""Copy an executive's live values into frozen values of events at the moment when they are reported.
 
 A parameter that cannot be recorded without changing its meaning raises `UnrecordableValue` with the reason. Results,
-arguments of failures and texts of the world never raise: a value that cannot be recorded becomes a `MissingValue`.
-Reading a value runs the code of its class (`__float__`, `__repr__`, properties), which may raise anything, so every
-`Exception` becomes the reason why that value is missing. Ctrl-C, and the SystemExit of a signal handler, which may come
-in the middle of that code, reach the caller. Reading is bounded in depth and in items, so it also ends for a structure
-that contains itself.
+arguments of failures and observations never raise: a value that cannot be recorded becomes a `MissingValue`, or null
+with its reason. Reading a value runs the code of its class (`__float__`, `__repr__`, properties), which may raise
+anything, so every `Exception` becomes the reason why that value is missing. Ctrl-C, and the SystemExit of a signal
+handler, which may come in the middle of that code, reach the caller. Reading is bounded in depth and in items, so it
+also ends for a structure that contains itself.
+
+Classes for poses and objects say so themselves, by `__recorded_as__` (`PoseLike`, `ObjectLike`); so this module knows
+neither a plan layer nor a world.
 """
 
 from __future__ import annotations
@@ -15,13 +18,14 @@ import json
 import logging
 import math
 import operator
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from enum import Enum
+from functools import partial
 from reprlib import Repr
 from types import NoneType
-from typing import Any, Final, Literal, NamedTuple, Protocol, TypeAlias, cast
+from typing import Any, ClassVar, Final, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 
@@ -37,22 +41,13 @@ from pycrorm_async.events.types import (
     ObjectValue,
     PoseValue,
 )
-from pycrorm_async.plan.language import Outcome
-from pycrorm_async.plan.objects import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
 from pycrorm_async.recorded_names import recorded_name
 from pycrorm_async.visible_text import visible
-from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.pose import Pose
-
-OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
-"""Field types whose values are recorded as objects; `ObjectPart` and `BelieveObject` are object designators too."""
-
-ObjectDtype: TypeAlias = Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
 
 REASON_MAX = 500
 """Bounds the characters of the reason why a value is missing, and of the messages inside an exception group."""
 DEPTH_MAX = 8
-"""Bounds the nesting of a result, of a failure's arguments and of exception groups."""
+"""Bounds the nesting of a value, of a failure's arguments and of exception groups."""
 ITEMS_MAX = 2**19
 """Bounds the items of one value. An item takes at least two bytes, so more exceed the default `record_bytes_max`."""
 
@@ -64,61 +59,87 @@ class UnrecordableValue(ValueError):
 class RefusedValue:
     """Replaces a value that an executive's own conversion refused; it is recorded as missing for this reason."""
 
-    def __init__(self, reason: str) -> None:
+    def __init__(self, reason: str, value: object = None) -> None:
         self.reason = reason
+        self.value = value
+
+
+class PoseLike(Protocol):
+    """A pose of an executive: metres, unit quaternion xyzw, frame name, UTC in ns. `__recorded_as__` is "pose"."""
+
+    __recorded_as__: ClassVar[str]
+
+    @property
+    def position(self) -> tuple[float, float, float]: ...
+    @property
+    def orientation(self) -> tuple[float, float, float, float]: ...
+    @property
+    def frame(self) -> str: ...
+    @property
+    def time_ns(self) -> int: ...
+
+
+class ObjectLike(Protocol):
+    """An object of an executive, or a designator of one. `__recorded_as__` is the `dtype` of its `ObjectValue`.
+
+    Attributes:
+        row_of: what `References` looks up: the object itself, the whole of a part, the reference of a located object.
+    """
+
+    __recorded_as__: ClassVar[str]
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def object_type(self) -> Any: ...
+    @property
+    def row_of(self) -> Any: ...
 
 
 class References(Protocol):
-    """Looks up the rows of an episode's world objects."""
+    """Looks up the rows of an episode's objects."""
 
-    def reference(self, world_object: Object) -> ObjectReference | None:
+    def reference(self, key: Any, /) -> ObjectReference | None:
         """Return the object's current row; None if the episode has no row of it."""
         ...
 
 
-def pose_value(pose: Pose) -> PoseValue:
+Encoder: TypeAlias = Callable[[Any, type[Enum] | None, References], Any]
+"""Converts a value to a JSON value of its declared type. Raises `UnrecordableValue`."""
+
+
+def recorded_as(kind: type) -> str | None:
+    """Return "pose", or the dtype of an object, for a class that is a `PoseLike` or an `ObjectLike`."""
+    return getattr(kind, "__recorded_as__", None)
+
+
+def pose_value(pose: PoseLike) -> PoseValue:
     """Copy a pose."""
     return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
 
 
-def encode_parameter(field: FieldDeclared, enum: type[Enum] | None, value: Any, references: References) -> Any:
-    """Convert a parameter to a JSON value of its field's declared type. Raises `UnrecordableValue`."""
-    encode_scalar = _ENCODERS.get(field.type)
-    if encode_scalar is not None:
-        return encode_scalar(value, enum, references)
+def encoder_of(field: FieldDeclared) -> Encoder:
+    """Return the encoder of a field's declared type."""
     if field.type == "list":
-        if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
-            raise _mismatch("list", value)
-        encode_item = _ENCODERS[field.item or "text"]
-        return [
-            encode_item(each, enum, references) if each is not None else None for each in _limit_items(value, value)
-        ]
-    assert field.type == "dict", field.type
-    if not isinstance(value, Mapping):
-        raise _mismatch("dict", value)
-    encode_item = _ENCODERS[field.item or "text"]
-    entries = {
-        _encode_key(key): encode_item(each, enum, references) if each is not None else None
-        for key, each in _limit_items(value, value.items())
-    }
-    if len(entries) < len(value):
-        raise UnrecordableValue("two keys of the dict have the same text")
-    return entries
+        return partial(_encode_list, _ENCODERS[field.item or "text"])
+    if field.type == "dict":
+        return partial(_encode_dict, _ENCODERS[field.item or "text"])
+    return _ENCODERS[field.type]
 
 
 def encode_or_missing(value: Any, references: References) -> Any:
     """Convert any value to a JSON value, or to a `MissingValue`. Raises no `Exception`."""
     try:
-        return _ValueReader(references).read(value, 0)
+        return ValueReader(references).read(value)
     except UnrecordableValue as reason:
         return missing_value(str(reason), value)
-    except Exception as error:  # noqa: BLE001  a user's __iter__ or property may raise anything
-        return missing_value(reading_fault(error), value)
 
 
 def missing_value(reason: str, value: Any) -> MissingValue:
     """Build the `MissingValue` that replaces a value, with a shortened reason and repr."""
-    return MissingValue(cut(clean(reason), REASON_MAX), clean_repr(value))
+    return MissingValue(
+        cut(clean(reason), REASON_MAX), clean_repr(value.value if isinstance(value, RefusedValue) else value)
+    )
 
 
 def missing_in(value: Any) -> Iterator[MissingValue]:
@@ -128,6 +149,50 @@ def missing_in(value: Any) -> Iterator[MissingValue]:
     elif isinstance(value, list | dict):
         for each in value.values() if isinstance(value, dict) else value:
             yield from missing_in(each)
+
+
+def read_parameters(
+    source: Any, fields: Iterable[Field], references: References, missing: dict[str, str]
+) -> dict[str, Any]:
+    """Read the parameters of a node as JSON values by field name, each on its own.
+
+    For each parameter that becomes a `MissingValue`, the function adds the reason to `missing`.
+    """
+    parameters: dict[str, Any] = {}
+    for name, read, encode, enum, *_ in fields:
+        value: Any = None
+        try:
+            value = read(source)
+            if value is not None:
+                parameters[name] = encode(value, enum, references)
+        except Exception as error:  # noqa: BLE001  a property or a __float__ of the user's may raise anything
+            if value is None and isinstance(error, AttributeError | KeyError):
+                continue
+            reason = str(error) if isinstance(error, UnrecordableValue) else reading_fault(error)
+            missing[name], parameters[name] = reason, missing_value(reason, value)
+    return parameters
+
+
+class Field(NamedTuple):
+    """A field of a designator type, and how its value is read and encoded.
+
+    Attributes:
+        read: raises `AttributeError` or `KeyError` where a node has no such parameter.
+        path: leads to the value from a designator, or is the executive's own name.
+        is_object: whether the value, or each of its items, is an object.
+    """
+
+    name: str
+    read: Callable[[Any], Any]
+    encode: Encoder
+    enum: type[Enum] | None = None
+    path: tuple[str, ...] = ()
+    is_object: bool = False
+
+
+def refuse(reason: str, _value: Any, _enum: type[Enum] | None, _references: References) -> Any:
+    """Encode no value, for this reason: that of a field without a column."""
+    raise UnrecordableValue(reason)
 
 
 # --- one encoder per declared type --------------------------------------------------------------------------------
@@ -189,7 +254,8 @@ def _encode_member(value: Any, enum: type[Enum] | None, references: References) 
 
 
 def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
-    if not isinstance(value, Pose) and not isinstance(value, PoseValue):  # a union takes 0.1 µs longer
+    is_copied = isinstance(value, PoseValue)
+    if not is_copied and recorded_as(type(value)) != "pose":
         raise _mismatch("Pose", value)
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
         raise UnrecordableValue(f"the pose holds a number that is not finite: {value}")
@@ -197,43 +263,24 @@ def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) 
         _require_writable(value.frame)
     except UnrecordableValue as reason:
         raise UnrecordableValue(f"the pose's frame: {reason}") from None
-    if isinstance(value, Pose):
+    if not is_copied:
         return pose_value(value)
     if (len(value.position), len(value.orientation)) != (3, 4):
         raise UnrecordableValue(f"a position has 3 numbers and an orientation 4: {value}")
-    return value
+    copied: PoseValue = value
+    return copied
 
 
 def _encode_object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
-    if isinstance(value, Object):
-        return references.reference(value) or _unrecorded_object(value)
-    if isinstance(value, ObjectPart):
-        return _object_value("ObjectPart", value, _row_in_force(value.part_of, references))
-    if isinstance(value, LocatedObject):
-        return _object_value("LocatedObject", value, _row_in_force(value.reference, references))
-    if isinstance(value, BelieveObject):
-        return _object_value("BelieveObject", value)
-    if isinstance(value, ObjectDesignator):
-        row = references.reference(value.world_object) if value.world_object is not None else None
-        return row or _unrecorded_object(value)
     if isinstance(value, ObjectReference | ObjectValue):
         return value
-    raise _mismatch("object designator", value)
-
-
-def _unrecorded_object(value: Any) -> ObjectValue:
-    return _object_value("Object", value)
-
-
-def _object_value(dtype: ObjectDtype, value: Any, part_of: ObjectReference | None = None) -> ObjectValue:
-    return ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value), part_of)
-
-
-def _row_in_force(designator: ObjectDesignator, references: References) -> ObjectReference | None:
-    """Return the current row of the designated world object; for a part, of the object it belongs to."""
-    while isinstance(designator, ObjectPart):
-        designator = designator.part_of
-    return references.reference(designator.world_object) if designator.world_object is not None else None
+    dtype: Any = recorded_as(type(value))
+    if dtype is None or dtype == "pose":
+        raise _mismatch("object designator", value)
+    row = references.reference(value.row_of) if value.row_of is not None else None
+    if dtype == "Object":
+        return row or ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value))
+    return ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value), row)
 
 
 def _pose_or_none(value: Any) -> PoseValue | None:
@@ -249,7 +296,25 @@ def _type_name(value: Any) -> str | None:
     return kind.name if isinstance(kind, Enum) else clean(str(kind)) if kind is not None else None
 
 
-_ENCODERS: dict[str, Callable[[Any, type[Enum] | None, References], Any]] = {
+def _encode_list(encode: Encoder, value: Any, enum: type[Enum] | None, references: References) -> list[Any]:
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
+        raise _mismatch("list", value)
+    return [encode(each, enum, references) if each is not None else None for each in _limit_items(value, value)]
+
+
+def _encode_dict(encode: Encoder, value: Any, enum: type[Enum] | None, references: References) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise _mismatch("dict", value)
+    entries = {
+        _encode_key(key): encode(each, enum, references) if each is not None else None
+        for key, each in _limit_items(value, value.items())
+    }
+    if len(entries) < len(value):
+        raise UnrecordableValue("two keys of the dict have the same text")
+    return entries
+
+
+_ENCODERS: dict[str, Encoder] = {
     "integer": _encode_integer,
     "real": _encode_real,
     "text": _encode_text,
@@ -262,7 +327,7 @@ _ENCODERS: dict[str, Callable[[Any, type[Enum] | None, References], Any]] = {
 
 
 class _NoReferences:
-    def reference(self, world_object: Object) -> ObjectReference | None:  # noqa: ARG002  the port's signature
+    def reference(self, _key: Any, /) -> ObjectReference | None:
         return None
 
 
@@ -304,56 +369,145 @@ def _stop_at_limit(items: Iterable[Any]) -> Iterator[Any]:
         yield each
 
 
-_ENCODERS_BY_CLASS: tuple[tuple[Any, Callable[[Any, type[Enum] | None, References], Any]], ...] = (
-    ((Pose, PoseValue), _encode_pose),
-    (datetime, _encode_datetime),
-    ((*OBJECT_TYPES, ObjectReference, ObjectValue), _encode_object),
-)
-"""The encoders of values without a declared type."""
+# === values without a declared type ===========================================================================
+#
+# Read results, arguments of failures and observations. The usual case, a dict of a few numbers, takes about a
+# microsecond.
+
+ARRAY_ITEMS_MAX: Final = 64
+"""Bounds the elements of an observed array that is recorded as JSON, each with a row of its own, as a joint state."""
+NPY: Final = "application/x-npy"
+"""Media type of an array that is stored as a blob: `numpy.load(io.BytesIO(content))`."""
+_INTEGERS: Final = range(-(2**63), 2**63)
+_NUMBERS: Final = "biuf"
+"""The dtype kinds of arrays whose elements JSON can hold."""
+_MEDIA_TYPE_MAX: Final = 255
+"""Bounds the characters of a blob's media type."""
 
 
-class _ValueReader:
-    """Converts one value without a declared type to a JSON value. Raises `UnrecordableValue`."""
+class ValueReader:
+    """Reads one value. Raises `UnrecordableValue` for one that cannot be recorded, unless it is an observation.
 
-    def __init__(self, references: References) -> None:
+    Args:
+        put_blob: of an observation, stores content with its media type; large contents become blobs. A part of an
+            observation that cannot be recorded is null.
+
+    Attributes:
+        missing: by path, the reason why a part is missing.
+        blobs: the references in the value, to be released when the event is put.
+    """
+
+    __slots__ = ("_enclosing_ids", "_left", "_put_blob", "_references", "blobs", "missing")
+
+    def __init__(self, references: References, put_blob: Callable[[bytes, str], BlobReference] | None = None) -> None:
         self._references = references
+        self._put_blob = put_blob
         self._left = ITEMS_MAX
         self._enclosing_ids: set[int] = set()
+        self.missing: dict[str, str] = {}
+        self.blobs: list[BlobReference] = []
 
-    def read(self, value: Any, depth: int) -> Any:
+    def read(self, value: Any, path: str = "", depth: int = 0) -> Any:
+        """Return the JSON value of `value`, at this path."""
+        kind = type(value)
+        if kind is float:
+            return value if math.isfinite(value) else self._note(path, f"{value} is not a finite number")
+        if kind is bool or value is None:
+            return value
+        if kind is int and value in _INTEGERS:
+            return value
+        if kind is str:
+            reason = unwritable(value)
+            return value if reason is None else self._note(path, reason)
         self._left -= 1
+        if depth > DEPTH_MAX:
+            return self._note(path, f"it is nested more than {DEPTH_MAX} deep")
+        try:
+            if kind is dict or kind is list or kind is tuple:
+                return self._items(value, path, depth)
+            return self._other(value, path, depth)
+        except UnrecordableValue as reason_:
+            return self._note(path, str(reason_))
+        except Exception as error:  # noqa: BLE001  a user's __iter__ or property may raise anything
+            return self._note(path, reading_fault(error))
+
+    def _note(self, path: str, reason: str) -> None:
+        if self._put_blob is None:
+            raise UnrecordableValue(reason)
+        self.missing[path] = reason
+
+    def _items(self, value: Any, path: str, depth: int) -> Any:
+        self._left -= len(value)
         if self._left < 0:
             raise UnrecordableValue(f"it holds more than {ITEMS_MAX:,} items")
-        if depth > DEPTH_MAX:
-            raise UnrecordableValue(f"it is nested more than {DEPTH_MAX} deep")
-        if isinstance(value, Enum):
-            return _require_writable(value.name)
-        if value is None or isinstance(value, bool | np.bool_):
-            return None if value is None else bool(value)
-        if isinstance(value, str | int | float):
-            return _require_writable(_as_built_in(value))
-        if isinstance(value, np.generic):
-            return self.read(value.item(), depth + 1)
-        for kind, encode in _ENCODERS_BY_CLASS:
-            if isinstance(value, kind):
-                return encode(value, None, self._references)
-        if isinstance(value, Outcome):
-            value = value.in_brief()
-        if isinstance(value, Mapping | list | tuple | np.ndarray):
-            return self._container(value, depth)
-        raise _mismatch("JSON", value)
-
-    def _container(self, value: Any, depth: int) -> Any:
         if id(value) in self._enclosing_ids:
             raise UnrecordableValue("it contains itself")
         self._enclosing_ids.add(id(value))
-        items: Any
+        prefix, items = f"{path}." if path else "", value
         if isinstance(value, Mapping):
-            items = {_encode_key(key): self.read(each, depth + 1) for key, each in value.items()}
+            keyed = {self._key(key): each for key, each in _limit_items(value, value.items())}
+            items = {key: self.read(each, f"{prefix}{key}", depth + 1) for key, each in keyed.items()}
         else:
-            items = [self.read(each, depth + 1) for each in value]
+            read = enumerate(_limit_items(value, value))
+            items = [self.read(each, f"{prefix}{index}", depth + 1) for index, each in read]
         self._enclosing_ids.discard(id(value))
         return items
+
+    def _key(self, key: Any) -> str:
+        text = _encode_key(key)
+        if self._put_blob is not None and text[:1] == "$":
+            raise UnrecordableValue("a key of the dict begins with $, which marks a blob")
+        return text
+
+    def _other(self, value: Any, path: str, depth: int) -> Any:
+        kind = type(value)
+        if isinstance(value, Enum):
+            return _require_writable(value.name)
+        if isinstance(value, str | int | float):
+            return _require_writable(_as_built_in(value))
+        if isinstance(value, np.generic):
+            return self.read(value.item(), path, depth + 1)
+        if isinstance(value, Blob):
+            return self._blob(value)
+        if isinstance(value, np.ndarray):
+            return self._array(value, path, depth)
+        if recorded_as(kind) == "pose" or isinstance(value, PoseValue):
+            return _encode_pose(value, None, self._references)
+        if recorded_as(kind) is not None or isinstance(value, ObjectReference | ObjectValue):
+            return _encode_object(value, None, self._references)
+        if isinstance(value, datetime):
+            return _encode_datetime(value, None, self._references)
+        if hasattr(kind, "in_brief"):  # an outcome of a plan
+            value = value.in_brief()
+        if isinstance(value, Mapping | list | tuple):
+            return self._items(value, path, depth)
+        raise _mismatch("JSON", value)
+
+    def _array(self, value: np.ndarray[Any, Any], path: str, depth: int) -> Any:
+        if self._put_blob is None or (value.dtype.kind in _NUMBERS and value.size <= ARRAY_ITEMS_MAX):
+            return self.read(value.tolist(), path, depth)
+        file = io.BytesIO()
+        np.save(file, value, allow_pickle=False)  # raises for an array of objects, or a user's own dtype
+        reference = self._put(file.getvalue(), NPY)
+        return BlobReference(reference.hash, NPY, reference.size, str(value.dtype), value.shape)
+
+    def _blob(self, value: Blob) -> BlobReference:
+        content, media_type = cast("tuple[object, object]", value)  # unchecked by the caller
+        if not isinstance(content, bytes | bytearray | memoryview):
+            raise UnrecordableValue(f"the content of a blob must be bytes, not {type(content).__name__}")
+        if not isinstance(media_type, str) or len(media_type) > _MEDIA_TYPE_MAX or unwritable(media_type):
+            raise UnrecordableValue(f"the media type of a blob must be a str of at most {_MEDIA_TYPE_MAX} characters")
+        return self._put(bytes(content), media_type)
+
+    def _put(self, content: bytes, media_type: str) -> BlobReference:
+        if self._put_blob is None:
+            raise UnrecordableValue("JSON cannot hold a Blob")
+        try:
+            reference = self._put_blob(content, media_type)
+        except ValueError as refusal:
+            raise UnrecordableValue(str(refusal)) from None
+        self.blobs.append(reference)
+        return reference
 
 
 def _as_built_in(value: str | float) -> str | int | float:
@@ -551,143 +705,11 @@ class MissingValues:
             _log.warning("%s", visible(warning))
 
 
-# === observed values ==========================================================================================
-#
-# Copy the values of an observation into JSON values; contents too large for an event become blobs.
-#
-# A part that cannot be recorded becomes null, with its path and the reason in `missing`; the other parts are recorded.
-# The usual case, a dict of a few numbers, takes about a microsecond.
-
-ARRAY_ITEMS_MAX: Final = 64
-"""Bounds the elements of an array that is recorded as JSON, each with a row of its own, as a joint state needs."""
-NPY: Final = "application/x-npy"
-"""Media type of an array that is stored as a blob: `numpy.load(io.BytesIO(content))`."""
-_DEPTH_MAX: Final = 8
-"""Bounds the nesting of observed values."""
-_INTEGERS: Final = range(-(2**63), 2**63)
-_NUMBERS: Final = "biuf"
-"""The dtype kinds of arrays whose elements JSON can hold."""
-_MEDIA_TYPE_MAX: Final = 255
-"""Bounds the characters of a blob's media type."""
-
-
-class ObservedReader:
-    """Reads the values of one observation. `put_blob` takes content and media type.
-
-    Attributes:
-        missing: by path, the reason why a value is missing.
-        blobs: the references in the values, to be released when the event is put.
-    """
-
-    __slots__ = ("_left", "_put_blob", "_references", "blobs", "missing")
-
-    def __init__(self, references: References, put_blob: Callable[[bytes, str], BlobReference]) -> None:
-        self._references = references
-        self._put_blob = put_blob
-        self._left = ITEMS_MAX
-        self.missing: dict[str, str] = {}
-        self.blobs: list[BlobReference] = []
-
-    def read(self, value: Any, path: str = "", depth: int = 0) -> Any:
-        """Return the JSON value of `value`, at this path in the observation."""
-        kind = type(value)
-        if kind is float:
-            return value if math.isfinite(value) else self._note(path, f"{value} is not a finite number")
-        if kind is bool or value is None:
-            return value
-        if kind is int and value in _INTEGERS:
-            return value
-        if kind is str:
-            reason = unwritable(value)
-            return value if reason is None else self._note(path, reason)
-        self._left -= 1
-        if depth > _DEPTH_MAX:
-            return self._note(path, f"it is nested more than {_DEPTH_MAX} deep")
-        if kind is dict:
-            return self._dict(value, path, depth)
-        if kind is list or kind is tuple:
-            return self._list(value, path, depth)
-        if isinstance(value, np.ndarray):
-            return self._array(value, path, depth)
-        if isinstance(value, Blob):
-            return self._blob(value, path)
-        return self._other(value, path)
-
-    def _dict(self, value: dict[Any, Any], path: str, depth: int) -> Any:
-        if (reason := self._fault_in_keys(value)) is not None:
-            return self._note(path, reason)
-        prefix = f"{path}." if path else ""
-        return {key: self.read(each, f"{prefix}{key}", depth + 1) for key, each in value.items()}
-
-    def _fault_in_keys(self, keys: Collection[Any]) -> str | None:
-        for key in keys:
-            if type(key) is not str:
-                return f"a key of the dict is a {type(key).__name__}, not a str"
-            if key[:1] == "$":
-                return "a key of the dict begins with $, which marks a blob"
-            if (reason := unwritable(key)) is not None:
-                return reason
-        return self._over_limit(len(keys))
-
-    def _list(self, value: list[Any] | tuple[Any, ...], path: str, depth: int) -> Any:
-        if (reason := self._over_limit(len(value))) is not None:
-            return self._note(path, reason)
-        prefix = f"{path}." if path else ""
-        return [self.read(each, f"{prefix}{index}", depth + 1) for index, each in enumerate(value)]
-
-    def _over_limit(self, count: int) -> str | None:
-        self._left -= count
-        return f"it holds more than {ITEMS_MAX:,} items" if self._left < 0 else None
-
-    def _array(self, value: np.ndarray[Any, Any], path: str, depth: int) -> Any:
-        if value.dtype.kind in _NUMBERS and value.size <= ARRAY_ITEMS_MAX:
-            return self.read(value.tolist(), path, depth)
-        try:
-            file = io.BytesIO()
-            np.save(file, value, allow_pickle=False)
-        except Exception as error:  # noqa: BLE001  an array of objects, or a user's own dtype
-            return self._note(path, reading_fault(error))
-        reference = self._put(file.getvalue(), NPY, path)
-        if reference is None:
-            return None
-        return BlobReference(reference.hash, NPY, reference.size, str(value.dtype), value.shape)
-
-    def _blob(self, value: Blob, path: str) -> Any:
-        content, media_type = cast("tuple[object, object]", value)  # unchecked by the caller
-        if not isinstance(content, bytes | bytearray | memoryview):
-            return self._note(path, f"the content of a blob must be bytes, not {type(content).__name__}")
-        if not isinstance(media_type, str) or len(media_type) > _MEDIA_TYPE_MAX or unwritable(media_type):
-            return self._note(path, f"the media type of a blob must be a str of at most {_MEDIA_TYPE_MAX} characters")
-        return self._put(bytes(content), media_type, path)
-
-    def _put(self, content: bytes, media_type: str, path: str) -> BlobReference | None:
-        try:
-            reference = self._put_blob(content, media_type)
-        except ValueError as refusal:
-            self._note(path, str(refusal))
-            return None
-        self.blobs.append(reference)
-        return reference
-
-    def _other(self, value: Any, path: str) -> Any:
-        encoded = encode_or_missing(value, self._references)
-        if isinstance(encoded, MissingValue):
-            return self._note(path, encoded.missing)
-        for each in missing_in(encoded):
-            return self._note(path, each.missing)
-        return encoded
-
-    def _note(self, path: str, reason: str) -> None:
-        self.missing[path] = reason
-
-
 # === plain values =============================================================================================
 #
 # Copy models of pydantic, dataclasses and containers of an executive as dicts and lists, or as a text of JSON.
 
 _PLAIN = frozenset({str, int, float, bool, NoneType})
-_RECORDED_AS_THEY_ARE = (Pose, Outcome, *OBJECT_TYPES)
-"""Dataclasses, and others, of which events have values of their own."""
 
 
 def plain_value(value: Any, simplified: Callable[[Any], Any] = lambda each: each) -> Any:
@@ -723,7 +745,7 @@ def _copy(value: Any, simplified: Callable[[Any], Any]) -> Any:
         return simple
     if hasattr(kind, "model_dump"):  # a model of pydantic, which this package does not need
         return _copy(value.model_dump(), simplified)
-    if is_dataclass(kind) and not isinstance(value, _RECORDED_AS_THEY_ARE):
+    if is_dataclass(kind) and recorded_as(kind) is None and not hasattr(kind, "in_brief"):
         return {each.name: _copy(getattr(value, each.name), simplified) for each in fields(kind)}
     return _copy_items(value, simplified) if isinstance(value, Mapping | list | tuple) else value
 

@@ -22,7 +22,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world import bullet_body
@@ -504,6 +504,7 @@ class Object:
     """The body in Bullet, for this package only: moving it notifies no observer."""
     copy_of: Object | None
     """The object of the original world of which this one is a copy; None outside copied worlds."""
+    __recorded_as__: ClassVar[str] = "Object"
 
     def __init__(
         self,
@@ -560,6 +561,11 @@ class Object:
 
     def __repr__(self) -> str:
         return f"Object({self.name!r}, {self.object_type.name}, {self.pose!r})"
+
+    @property
+    def row_of(self) -> Self:
+        """The object of which a memory has a row: itself."""
+        return self
 
     def _log_left_out(self) -> None:
         remarks = [*self.model.left_out, *self.body.remarks]

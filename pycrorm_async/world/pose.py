@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, MissingExtra
@@ -103,6 +103,7 @@ class Pose:
     orientation: Quaternion
     frame: str
     time_ns: int = field(compare=False)
+    __recorded_as__: ClassVar[str] = "pose"
 
     def __init__(
         self,

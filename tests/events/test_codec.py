@@ -52,7 +52,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.projections.columns import Layout, unite
-from pycrorm_async.record.declarations import declared_type
+from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.recorded_names import recorded_name
 
 # === codec ====================================================================================================

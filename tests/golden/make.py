@@ -26,8 +26,8 @@ from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
-from pycrorm_async.record.declarations import declared_type
-from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.declarations import DeclaredType
+from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

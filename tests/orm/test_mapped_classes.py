@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from inspect import isabstract
 from typing import Any
 
 import msgspec
@@ -34,7 +35,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.projections.columns import Layout
 from pycrorm_async.projections.mapped_tables import mapped_leaves
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.record.declarations import declared_type
+from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import ObjectType
 from tests.commands import environment
@@ -47,7 +48,13 @@ from tests.projections.sql_queries import stored_and_folded
 # The shipped mapped classes agree with the shipped designators, field by field.
 
 MODULES = (actions, motions)
-PERFORMABLES = [getattr(module, name) for module in MODULES for name in module.__all__]
+PERFORMABLES = [
+    each
+    for module in MODULES
+    for each in vars(module).values()
+    if isinstance(each, type) and issubclass(each, ActionAbstract | BaseMotion) and each.__module__ == module.__name__
+    if not isabstract(each)
+]
 
 
 @pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)

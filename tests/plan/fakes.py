@@ -10,7 +10,16 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pycrorm_async.plan import ActionAbstract, CollectedTree, PlanFailure, Resource
-from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Seen, Simulation, current_simulation, recorder
+from pycrorm_async.plan.execution import (
+    Candidate,
+    Cells,
+    Refusal,
+    Search,
+    Seen,
+    Simulation,
+    current_simulation,
+    recorder,
+)
 from pycrorm_async.plan.task import TaskTreeNode, current_node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import ObjectType
@@ -68,23 +77,12 @@ class Recording:
         self.ended.append(node)
         self.notes.append(f"end {type(node.designator).__name__} {node.status.name}")
 
-    def location_resolved(
-        self,
-        *,
-        location: str,
-        offered: tuple[Candidate, ...],
-        taken: int | None,
-        considered: int,
-        refused: tuple[Refusal, ...],
-        offered_beyond: int,
-        cells: Cells | None,
-        node: TaskTreeNode | None,
-    ) -> None:
-        self.refused.append(refused)
-        self.offered_beyond.append(offered_beyond)
-        self.cells.append(cells)
-        self.places.append((location, offered, taken, considered, node))
-        self.notes.append(f"place {location}")
+    def location_resolved(self, search: Search) -> None:
+        self.refused.append(tuple(search.refused))
+        self.offered_beyond.append(search.offered_beyond)
+        self.cells.append(search.cells)
+        self.places.append((search.location, tuple(search.offered), search.taken, search.considered, search.node))
+        self.notes.append(f"place {search.location}")
 
     def object_detected(
         self,

@@ -28,7 +28,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
-from pycrorm_async.plan.execution import PlanObserver, Simulation, recorder
+from pycrorm_async.plan.execution import PlanObserver, Search, Simulation, recorder
 from pycrorm_async.plan.task import TaskTreeNode as Node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
@@ -104,8 +104,8 @@ class WorldObserver:
     def node_ended(self, node: Node) -> None:
         self.memory.node_ended(node)
 
-    def location_resolved(self, **arguments: Any) -> None:
-        self.memory.location_resolved(**arguments)
+    def location_resolved(self, search: Search) -> None:
+        self.memory.location_resolved(search)
 
     def object_detected(self, **arguments: Any) -> None:
         self.memory.object_detected(**arguments)

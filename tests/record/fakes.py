@@ -10,16 +10,18 @@ from typing import Any
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolFull
-from pycrorm_async.events.codec import Heading, Receipt, decode
+from pycrorm_async.events.codec import Heading, decode
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import Happening
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
-from pycrorm_async.record.episode import Episode
+from pycrorm_async.record.declarations import KnownTypes
 from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
-from pycrorm_async.record.plan_recorder import Recorder, current_episode
+from pycrorm_async.record.plan_recorder import Episode, Recorder, current_episode
+from pycrorm_async.record.plan_types import built_in_declaration
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.bullet import watcher
 
@@ -42,19 +44,14 @@ class ListSink:
         self.before_end: Callable[[], None] = lambda: None
         """Called before the end of each node is put."""
 
-    def put_nowait(
-        self, heading: Heading, payload: bytes, *, reserved: bool = False, receipt: Receipt | None = None
-    ) -> int:
+    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         if heading.type == "NodeEnded":
             self.before_end()
         with self.lock:
             if heading.episode is not None and self.sequences.get(heading.episode, 0) + 1 == self.fails_at:
                 self.fails_at = None
                 raise RuntimeError("the disk is on fire")
-            sequence = self._put(heading, payload, reserved)
-            if receipt is not None:
-                receipt.sequence = sequence
-            return sequence
+            return self._put(heading, payload, reserved)
 
     def _put(self, heading: Heading, payload: bytes, reserved: bool) -> int:
         if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:
@@ -100,7 +97,8 @@ class RecorderCase:
         self.sink = ListSink()
         self.emitter = Emitter(self.sink, settings)
         episodes = OpenEpisodes(self.emitter, SYSTEM_CLOCK)
-        self.recorder = Recorder(self.emitter, episodes=episodes, software="test")
+        known = KnownTypes(built_in_declaration)
+        self.recorder = Recorder(Recording(self.emitter, episodes, known, (), software="test"))
 
     @contextmanager
     def episode(self) -> Iterator[Episode]:

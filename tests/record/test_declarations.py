@@ -23,8 +23,8 @@ from pycrorm_async.plan import task
 from pycrorm_async.plan.actions import PickUpActionPerformable
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.objects import ObjectDesignator
-from pycrorm_async.record.declarations import Declarations, FieldSpec, KnownTypes, declare_type, declared_type
-from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.declarations import Declared, FieldSpec, KnownTypes, declare_named
+from pycrorm_async.record.plan_types import Declarations, built_in_declaration, declared_type
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Pose
 from tests.commands import pycrorm
@@ -133,8 +133,9 @@ def test_a_reserved_name_gets_an_underscore() -> None:
         async def perform(self) -> None:
             """Succeed without doing anything."""
 
-    (declared,) = declared_type(ReservedActionPerformable).fields
-    assert declared == (FieldDeclared("robot_state_", "robot_state_", "text", 2), ("robot_state",), None)
+    declared = declared_type(ReservedActionPerformable)
+    assert declared.declaration.fields == (FieldDeclared("robot_state_", "robot_state_", "text", 2),)
+    assert [(each.name, each.path) for each in declared.fields] == [("robot_state_", ("robot_state",))]
 
 
 def test_a_class_with_fields_that_is_no_dataclass_is_refused() -> None:
@@ -183,8 +184,8 @@ def saying(place: int) -> type[ActionAbstract]:
 
 def test_two_live_classes_with_one_dtype_are_refused_with_both_paths() -> None:
     first, second = saying(0), saying(1)
-    declarations = Declarations()
-    seen: list[DeclaredType] = []
+    declarations = Declarations(KnownTypes(built_in_declaration))
+    seen: list[Declared] = []
     declarations.of(first, seen.append)
     with pytest.raises(DeclarationRefused) as refused:
         declarations.of(second, seen.append)
@@ -195,12 +196,12 @@ def test_two_live_classes_with_one_dtype_are_refused_with_both_paths() -> None:
 
 def test_a_class_defined_again_at_the_same_place_replaces_the_first() -> None:
     first, again = saying(0), saying(0)
-    declarations = Declarations()
-    seen: list[DeclaredType] = []
+    declarations = Declarations(KnownTypes(built_in_declaration))
+    seen: list[Declared] = []
     one = declarations.of(first, seen.append)
     assert declarations.of(first, seen.append) is one
     declarations.of(again, seen.append)
-    assert [each.fingerprint for each in seen] == [one.fingerprint, one.fingerprint]
+    assert [each.type.fingerprint for each in seen] == [one.fingerprint, one.fingerprint]
 
 
 def test_a_class_defined_again_with_another_type_is_refused_with_both_types() -> None:
@@ -211,8 +212,8 @@ def test_a_class_defined_again_with_another_type_is_refused_with_both_types() ->
         namespace = {"__annotations__": {"many": kind}, "perform": perform, "__qualname__": "CountingAction"}
         return dataclass(type("CountingAction", (ActionAbstract,), namespace))
 
-    declarations = Declarations()
-    seen: list[DeclaredType] = []
+    declarations = Declarations(KnownTypes(built_in_declaration))
+    seen: list[Declared] = []
     declarations.of(counting(int), seen.append)
     with pytest.raises(DeclarationRefused, match="field 'many' was integer before and is real now"):
         declarations.of(counting(float), seen.append)
@@ -228,7 +229,7 @@ def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
             """Succeed without doing anything."""
 
     with pytest.raises(DeclarationRefused, match=r"plan\.actions\.NavigateActionPerformable already has the dtype"):
-        Declarations().of(NavigateAction, lambda _: None)
+        Declarations(KnownTypes(built_in_declaration)).of(NavigateAction, lambda _: None)
 
 
 @pytest.mark.parametrize("dtype", ["we ird'", "pose__1", "", "1st", "a-b"])
@@ -286,7 +287,7 @@ def test_an_invalid_alias_is_refused(aliases: Any, reason: str) -> None:
 
 
 def test_two_live_classes_with_one_former_name_are_refused() -> None:
-    live = Declarations()
+    live = Declarations(KnownTypes(built_in_declaration))
     welcome, hello = renamed(("GreetAction",)), renamed(("GreetAction",), "HelloAction")
     live.of(welcome, lambda _: None)
     with pytest.raises(DeclarationRefused, match=r"WelcomeAction already has the alias 'GreetAction'"):
@@ -404,7 +405,7 @@ def test_each_memory_searches_the_classes_for_a_built_in_type_once() -> None:
 
     known_types = KnownTypes(find)
     for _ in range(2):
-        declare_type("action", "Wipe", {}, known_types)
+        declare_named("action", "Wipe", {}, known_types)
     assert searched == ["Wipe"]
 
 
@@ -429,7 +430,8 @@ def test_a_prepared_type_is_declared_when_it_is_asked_for_as_one_that_was_not_pr
                 types = [
                     memory.recording.type("action", each, fields, bases=("Move",)) for each in ("PickUpAction", "Wipe")
                 ]
-            declared.append((types, memory.status.missing))
+                paths = [[(each.name, each.path) for each in declared_kind.fields] for declared_kind in types]
+                declared.append(([each.payload for each in types], paths, memory.status.missing))
             assert memory.status.faults == (0, None)
         assert declared_dtypes(tmp_path / folder) == ["PickUpAction", "Wipe"]
         assert_verified(tmp_path / folder)
@@ -446,7 +448,7 @@ def test_a_type_declared_after_another_was_prepared_keeps_its_table_and_columns(
             recording.type("action", "pourAction", {"cup": "text"})
             wipe = recording.type("action", "Wipe", {"side": "text"})
             pour = recording.type("action", "PourAction", {"cup": "text"})
-        assert [each.declared.name for each in wipe.fields] == ["side_text"]
+        assert [each.name for each in wipe.fields] == ["side_text"]
         assert (pour.dtype, pour.declaration.table) == ("PourActionAction", "pour_action_action")
         assert memory.status.faults == (0, None)
     assert_verified(tmp_path)
@@ -457,7 +459,7 @@ def test_preparing_a_type_of_the_same_table_as_another_reserves_no_name(tmp_path
         memory.recording.prepare("action", "PickUpAction", {"arm": "text"})
         declared = memory.recording.type("action", "pickUpAction", {"arm": "integer"})
         assert (declared.dtype, declared.declaration.table) == ("pickUpAction", "pick_up_action")
-        assert [each.declared.name for each in declared.fields] == ["arm"]
+        assert [each.name for each in declared.fields] == ["arm"]
     assert declared_dtypes(tmp_path) == ["pickUpAction"]
 
 
@@ -469,7 +471,7 @@ def test_a_type_that_cannot_be_prepared_is_counted_and_does_not_reach_the_caller
 
 
 def test_threads_that_ask_for_one_type_at_once_get_one_declaration(tmp_path: Path) -> None:
-    declared: list[DeclaredType] = []
+    declared: list[Any] = []
     together = threading.Barrier(8)
     with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
 

@@ -24,8 +24,6 @@ from pycrorm_async.events.codec import Record, declaration_of, decode
 from pycrorm_async.events.fields import RESERVED_COLUMNS
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, NodeStarted
-from pycrorm_async.operations.copy import copy_episodes
-from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, TaskTreeNode
 from pycrorm_async.orm.base import Base
 from pycrorm_async.plan import ActionAbstract, BaseMotion
@@ -35,14 +33,14 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.success import success_samples
 from pycrorm_async.recall.columns import RESERVED
-from pycrorm_async.record.declarations import declared_type
+from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.contracts import check_designator
-from tests.databases import Server, ask, put_memory
+from tests.databases import ask, put_memory
 
 _METHODS = {"perform", "resources", "resolve"}
 _OF_SQL = "rowid oid ctid xmin tableoid true false order group select user limit picked placed added earlier later"
@@ -100,11 +98,11 @@ async def performed(kind: type) -> list[Recorded]:
     for designator in designators(kind):
         declared = declared_type(designator)
         names = [each.name for each in dataclasses.fields(designator)]  # type: ignore[arg-type]  # made above
-        assert [path for _, path, _ in declared.fields] == [(each,) for each in names]
+        assert [each.path for each in declared.fields] == [(each,) for each in names]
         rows = [dict.fromkeys(names, value) for value in _VALUES[kind]]
         for values in rows:
             await designator(**values).perform()
-        fields = {path[-1]: field for field, path, _ in declared.fields}
+        fields = dict(zip(names, declared.declaration.fields, strict=True))
         done.append(Recorded(declared.dtype, declared.declaration.table, fields, rows, designator))
     return done
 
@@ -115,12 +113,12 @@ def received(recording: Recording, episode: RecordedEpisode, kind: type) -> list
     for first in range(0, len(NAMES), 25):
         names = NAMES[first : first + 25]
         declared = recording.type("action", f"{kind.__name__.title()}{first}Other", dict.fromkeys(names, kind))
-        assert [path for _, path, _ in declared.fields] == [(each,) for each in names]
+        assert [each.path for each in declared.fields] == [(each,) for each in names]
         rows = [dict.fromkeys(names, value) for value in _VALUES[kind]]
         for values in rows:
             episode.start("node", declared, values)
             episode.end("node", "SUCCEEDED")
-        fields = {path[-1]: field for field, path, _ in declared.fields}
+        fields = dict(zip(names, declared.declaration.fields, strict=True))
         done.append(Recorded(declared.dtype, declared.declaration.table, fields, rows, None))
     return done
 
@@ -178,25 +176,6 @@ async def test_a_field_with_a_name_of_ours_has_its_value_in_node_view_class_fram
         assert not memory.status.faults.total
         await assert_shown(memory, types, tmp_path)
     await assert_clean(database_url)
-
-
-@pytest.mark.soak
-async def test_fields_with_names_of_ours_are_copied_to_the_other_database_and_rebuilt(
-    server: Server, tmp_path: Path
-) -> None:
-    source, target = put_memory(tmp_path / "memory.db"), server.new_memory()
-    types: list[Recorded] = []
-    async with Memory.open(source) as memory, memory.episode(description="names of ours"):
-        for kind in _VALUES:
-            types += await performed(kind)
-    await copy_episodes(source, target)
-    for url in (source, target):
-        await assert_clean(url)
-        await rebuild_memory(url)
-        await assert_clean(url)
-    async with Memory.open(target) as memory:
-        await assert_shown(memory, types, tmp_path)
-    server.drop_soon(target)
 
 
 def test_a_reserved_name_gets_underscores_until_no_other_field_has_it() -> None:

@@ -19,7 +19,7 @@ import pytest
 import pycrorm_async
 from pycrorm_async import Settings
 from pycrorm_async.events.order import OrderCheck
-from pycrorm_async.events.types import EpisodeEnded, Happening, NodeEnded, NodeStarted
+from pycrorm_async.events.types import LOSES_OPEN_NODES, EpisodeEnded, Happening, NodeEnded, NodeStarted
 from pycrorm_async.plan.execution import recorder as observing
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.plan.language import ActionAbstract
@@ -119,13 +119,18 @@ def interrupt_everywhere(
 
 
 def assert_in_order(log: list[tuple[int, Happening]]) -> None:
-    """Check that the log is legal, that each node has one end, and that the episode has one."""
+    """Check that the log is legal, that the episode has its end, and each node one, or ends with the episode."""
     check = OrderCheck()
     findings = [finding for sequence, event in log for finding in check.read(sequence, event)]
     assert [each for each in findings if each.kind == "damage"] == []
     started = [sequence for sequence, event in log if isinstance(event, NodeStarted)]
-    assert sorted(event.node for _, event in log if isinstance(event, NodeEnded)) == started
-    assert isinstance(log[-1][1], EpisodeEnded)
+    ended = [event.node for _, event in log if isinstance(event, NodeEnded)]
+    assert len(ended) == len({*ended})
+    assert {*ended} <= {*started}
+    assert len(ended) >= len(started) - 1
+    last = log[-1][1]
+    assert isinstance(last, EpisodeEnded)
+    assert len(ended) == len(started) or last.status in LOSES_OPEN_NODES
 
 
 @pytest.mark.slow
@@ -175,7 +180,7 @@ class FailingActionPerformable(ActionAbstract):
 @pytest.mark.slow
 @pytest.mark.every_python
 def test_an_interrupt_at_any_call_of_our_own_plan_neither_hangs_nor_damages_the_log(recorded: Recorded) -> None:
-    hooks = Recorder(recorded.emitter, episodes=recorded.episodes, software="test")
+    hooks = Recorder(recorded.recording)
 
     async def plan() -> None:
         episode = hooks.open_episode(description="d")
@@ -235,18 +240,12 @@ def test_an_exit_at_any_call_leaves_the_plan(recorded: Recorded) -> None:
 def test_no_loop_is_directly_in_a_block_that_holds_a_lock(module: ModuleType) -> None:
     """Python 3.12 and 3.13 leave the block with the lock taken if a handler raises where a loop jumps back."""
     tree = ast.parse(inspect.getsource(module))
-    blocks = [each for each in ast.walk(tree) if isinstance(each, ast.With) and "lock" in ast.unparse(each.items[0])]
+    blocks: list[ast.AST] = [
+        each for each in ast.walk(tree) if isinstance(each, ast.With) and "lock" in ast.unparse(each.items[0])
+    ]
+    blocks += [each for each in ast.walk(tree) if isinstance(each, ast.Try) and "_is_running" in ast.unparse(each)]
     loops = (ast.For, ast.While, ast.ListComp, ast.DictComp, ast.SetComp)
     assert [each.lineno for block in blocks for each in ast.walk(block) if isinstance(each, loops)] == []
-
-
-@pytest.mark.slow
-@pytest.mark.every_python
-def test_a_loop_is_never_directly_before_the_end_of_being_busy() -> None:
-    tree = ast.parse(inspect.getsource(recorded_episode))
-    busy = [each for each in ast.walk(tree) if isinstance(each, ast.Try) and "is_busy" in ast.unparse(each)]
-    assert len(busy) == 1
-    assert [each for each in ast.walk(busy[0]) if isinstance(each, ast.For | ast.While)] == []
 
 
 # === interrupted activations ==================================================================================

@@ -31,15 +31,13 @@ from pycrorm_async.events.types import (
     PoseValue,
 )
 from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable
-from pycrorm_async.plan.execution import Candidate, Cells, Refusal
-from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Search
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.motions import simulated_robot
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
 from pycrorm_async.plan.task import current_node
 from pycrorm_async.record import geometry
-from pycrorm_async.record.episode import Episode
-from pycrorm_async.record.plan_recorder import current_episode
+from pycrorm_async.record.plan_recorder import Episode, current_episode
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
@@ -216,14 +214,6 @@ async def test_a_perform_outside_any_episode_opens_one_of_its_own() -> None:
         assert events[-1][1] == EpisodeEnded("SUCCEEDED")
 
 
-async def test_nan_in_a_pose_names_the_designator_and_the_field() -> None:
-    refusal = r"^NavigateAction\.target_location cannot be recorded: the pose holds"
-    strict = Settings(on_unrecordable="refuse")
-    with recorder_case(strict) as case, case.episode(), pytest.raises(Unrecordable, match=refusal):
-        await NavigateActionPerformable(Pose([math.nan, 0, 0])).perform()
-    assert case.emitter.faults.total == 0
-
-
 async def test_nodes_that_outlive_their_episode_are_lost_to_it() -> None:
     begun, leave = asyncio.Event(), asyncio.Event()
 
@@ -249,43 +239,15 @@ async def test_nodes_that_outlive_their_episode_are_lost_to_it() -> None:
 async def test_a_resolved_location_is_recorded_with_its_node() -> None:
     with recorder_case() as case, case.episode() as episode:
         pose = Pose([1.0, 2.0, 0.0], time_ns=5)
-        case.recorder.location_resolved(
-            location="CostmapLocation",
-            offered=(Candidate(pose, (Arms.LEFT,)),),
-            taken=0,
-            considered=7,
-            refused=(Refusal(pose, "LEFT: too far"), Refusal(pose, "hidden\0")),
-            offered_beyond=0,
-            cells=Cells(occupied=3, hidden=2, free=9),
-            node=None,
-        )
+        refused = [Refusal(pose, "LEFT: too far"), Refusal(pose, "hidden\0")]
+        offered, cells = [Candidate(pose, (Arms.LEFT,))], Cells(occupied=3, hidden=2, free=9)
+        case.recorder.location_resolved(Search("CostmapLocation", None, offered, 0, 7, refused, cells=cells))
     event = next(e for _, e in case.sink.of(episode) if isinstance(e, LocationResolved))
     assert event.offered[0].pose == PoseValue((1.0, 2.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 5)
     assert (event.offered[0].arms, event.taken, event.considered, event.node) == (("LEFT",), 0, 7, None)
     assert [each.reason for each in event.refused] == ["LEFT: too far", "hidden\\x00"]
     assert {each.pose for each in event.refused} == {event.offered[0].pose}
     assert event.cells == CellsValue(3, 2, 9)
-
-
-async def test_three_plans_in_three_tasks_never_share_a_parent() -> None:
-    @dataclass
-    class OuterActionPerformable(ActionAbstract):
-        name: str
-
-        async def perform(self) -> None:
-            for index in range(5):
-                await asyncio.sleep(0)
-                await NoteActionPerformable(f"{self.name}{index}").perform()
-
-    with recorder_case() as case, case.episode() as episode:
-        await asyncio.gather(*(OuterActionPerformable(name).perform() for name in "abc"))
-    events = case.sink.of(episode)
-    assert findings(events) == []
-    starts = {sequence: event for sequence, event in events if isinstance(event, NodeStarted)}
-    for event in starts.values():
-        if "text" in event.parameters:
-            assert event.parent is not None
-            assert starts[event.parent].parameters["name"] == event.parameters["text"][0]
 
 
 async def test_leaving_a_world_removes_its_objects() -> None:
@@ -445,15 +407,6 @@ async def test_a_parameter_that_cannot_be_recorded_is_refused_before_perform_run
     assert findings(case.sink.of(episode)) == []
 
 
-async def test_a_parameter_that_cannot_be_recorded_is_recorded_as_missing() -> None:
-    with recorder_case() as case, case.episode() as episode:
-        note = NoteActionPerformable("x", weight=math.nan)
-        await note.perform()
-        assert note.ran
-    start = next(e for _, e in case.sink.of(episode) if isinstance(e, NodeStarted) and e.kind == "action")
-    assert start.parameters["weight"] == {"missing": "nan is not a finite number", "repr": "nan"}
-
-
 async def test_a_start_that_is_too_large_is_refused_with_the_limit() -> None:
     small = Settings(record_bytes_max=2_000, on_unrecordable="refuse")
     with recorder_case(small) as case, case.episode(), pytest.raises(Unrecordable, match=r"2,000 are allowed"):
@@ -471,52 +424,6 @@ async def test_a_result_that_is_too_large_is_recorded_as_missing() -> None:
     end = next(e for _, e in case.sink.of(episode) if isinstance(e, NodeEnded))
     assert end.status == "SUCCEEDED"
     assert "2,000 are allowed" in end.result["missing"]
-
-
-@pytest.mark.parametrize(
-    ("raised", "node_status", "episode_status"),
-    [
-        (PlanFailure("spilled", 3), "FAILED", "FAILED"),
-        (ValueError("spilled", 3), "ERROR", "ERROR"),
-        (ExceptionGroup("spilled", [PlanFailure("a"), PlanFailure("b")]), "FAILED", "FAILED"),
-        (ExceptionGroup("spilled", [PlanFailure("a"), ValueError("b")]), "ERROR", "ERROR"),
-        (asyncio.CancelledError("spilled", 3), "CANCELLED", "INTERRUPTED"),
-        (KeyboardInterrupt("spilled", 3), "CANCELLED", "INTERRUPTED"),
-        (SystemExit("spilled", 3), "ERROR", "ERROR"),
-    ],
-)
-def test_a_failure_keeps_class_message_and_arguments(
-    raised: BaseException, node_status: str, episode_status: str
-) -> None:
-    @dataclass
-    class FailActionPerformable(ActionAbstract):
-        async def perform(self) -> None:
-            raise raised
-
-    async def plan(case: RecorderCase) -> None:
-        with case.episode():
-            await FailActionPerformable().perform()
-
-    with recorder_case() as case:
-        loop = asyncio.new_event_loop()
-        try:
-            with pytest.raises(type(raised)):
-                loop.run_until_complete(plan(case))
-        finally:
-            loop.close()
-    events = case.sink.only()
-    assert findings(events) == []
-    end = events[-3][1]
-    assert isinstance(end, NodeEnded)
-    assert end.failure is not None
-    kind = type(raised)
-    assert (end.status, end.failure.type) == (node_status, f"{kind.__module__}.{kind.__qualname__}")
-    assert end.failure.message == str(raised)
-    assert "spilled" in end.failure.message
-    assert end.failure.arguments[0] == "spilled"
-    assert len(end.failure.arguments) == 2
-    assert isinstance(events[-1][1], EpisodeEnded)
-    assert events[-1][1].status == episode_status
 
 
 async def test_a_fault_of_the_memory_never_reaches_the_plan_and_is_counted() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -18,6 +16,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory
 from pycrorm_async.clock import monotonic_ns
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.types import Happening, NodeEnded, NodeStarted, StateSampled
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import StateSample, TaskTreeNode
@@ -35,7 +34,6 @@ from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.commands import environment
 from tests.memory.note_actions import url_of
 from tests.record.fakes import RecorderCase, findings, recorder_case
 
@@ -219,10 +217,14 @@ async def test_a_fault_of_the_recorder_is_counted_and_the_motion_continues(case:
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
         before = case.emitter.faults.total
 
-        def broken(*_arguments: object) -> None:
-            raise RuntimeError("the sampler is on fire")
+        put = case.sink.put_nowait
 
-        case.emitter.offer = broken  # type: ignore[method-assign,assignment]
+        def broken(heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+            if heading.type == "StateSampled":
+                raise RuntimeError("the sampler is on fire")
+            return put(heading, payload, reserved=reserved)
+
+        case.sink.put_nowait = broken  # type: ignore[method-assign]
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
     assert require_robot().body.pose == Pose([1, 0, 0])
     assert case.emitter.faults.total == before + 1
@@ -559,18 +561,6 @@ async def test_the_state_at_any_moment_is_the_last_written_value_of_each_channel
 
 
 @pytest.mark.slow
-async def test_no_samples_are_taken_unless_requested(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with BulletWorld(), simulated_robot:
-            Object("pr2", ObjectType.ROBOT)
-            await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-        await memory.flush()
-        assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
-        async with memory.session() as session:
-            assert (await session.scalars(select(StateSample))).all() == []
-
-
-@pytest.mark.slow
 async def test_a_memory_that_is_closed_during_a_motion_ends_its_thread(tmp_path: Path) -> None:
     with BulletWorld(), ChosenRobot("mine", Driving()):
         Object("pr2", ObjectType.ROBOT)
@@ -584,48 +574,3 @@ async def test_a_memory_that_is_closed_during_a_motion_ends_its_thread(tmp_path:
         assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
         await driving
         assert require_robot().body.pose == Pose([1, 0, 0])
-
-
-@pytest.mark.slow
-@pytest.mark.soak
-def test_a_forked_child_continues_without_sampling_and_its_parent_keeps_sampling(tmp_path: Path) -> None:
-    script = (
-        "import asyncio, os, sys, threading, warnings\n"
-        "warnings.simplefilter('ignore')\n"
-        "from sqlalchemy import select\n"
-        "from pycrorm_async import Memory, Settings\n"
-        "from pycrorm_async.orm import StateSample\n"
-        "from pycrorm_async.plan import *\n"
-        "from pycrorm_async.plan.objects import require_robot\n"
-        "from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose\n"
-        "from tests.record.test_state_samples import Driving\n"
-        "class Forking(Driving):\n"
-        "    child = None\n"
-        "    async def navigate(self, motion):\n"
-        "        if self.child is None:\n"
-        "            self.child = os.fork()\n"
-        "        require_robot().body.set_pose(motion.target)\n"
-        "async def main():\n"
-        "    robot = Forking()\n"
-        "    async with Memory.open(sys.argv[1], settings=Settings(sample_interval_ms=1)) as memory:\n"
-        "        with BulletWorld(), ChosenRobot('mine', robot):\n"
-        "            Object('pr2', ObjectType.ROBOT)\n"
-        "            await NavigateActionPerformable(Pose([1, 0, 0])).perform()\n"
-        "            if robot.child == 0:\n"
-        "                await NavigateActionPerformable(Pose([2, 0, 0])).perform()\n"
-        "                names = [each.name for each in threading.enumerate()]\n"
-        "                os._exit(7 if 'pycrorm sampler' not in names else 1)\n"
-        "            assert os.waitstatus_to_exitcode(os.waitpid(robot.child, 0)[1]) == 7\n"
-        "            await NavigateActionPerformable(Pose([3, 0, 0])).perform()\n"
-        "        await memory.flush()\n"
-        "        async with memory.session() as session:\n"
-        "            rows = (await session.scalars(select(StateSample).order_by(StateSample.id))).all()\n"
-        "            values = [row.value for row in rows if row.channel == 'base.x']\n"
-        "            print(values, memory.status.faults.total)\n"
-        "asyncio.run(main())\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script, url_of(tmp_path)],
-        env=environment(), capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert (done.stdout, done.returncode) == ("[0.0, 1.0, 1.0, 3.0] 0\n", 0), done.stderr

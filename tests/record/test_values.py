@@ -16,7 +16,7 @@ from pycrorm_async.record.values import (
     UnrecordableValue,
     clean_repr,
     encode_or_missing,
-    encode_parameter,
+    encoder_of,
     failure_value,
 )
 from pycrorm_async.world.pose import Arms, ObjectType, Pose
@@ -40,7 +40,7 @@ class Broken:
 
 
 def write(kind: FieldType, value: Any, enum_class: type[enum.Enum] | None = None, item: Any = None) -> Any:
-    return encode_parameter(FieldDeclared("f", "f", kind, 2, item=item), enum_class, value, NOBODY)
+    return encoder_of(FieldDeclared("f", "f", kind, 2, item=item))(value, enum_class, NOBODY)
 
 
 @pytest.mark.parametrize(
