@@ -24,7 +24,6 @@ from pycrorm_async.plan import (
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     NoRobotHere,
-    ObjectDesignator,
     ObjectPart,
     OpenAction,
     OpenActionPerformable,
@@ -297,17 +296,6 @@ async def test_an_impossible_access_names_the_reason_and_moves_nothing(
     assert scene.world.save_state() == before
 
 
-async def test_an_arm_that_the_robot_lacks_opens_nothing(scene: Scene, one_armed: None) -> None:
-    part = await SINK.base_placed_by(scene)
-    before = scene.world.save_state()
-    for action in (OpenActionPerformable, CloseActionPerformable, OpeningMotion, ClosingMotion):
-        with pytest.raises(CapabilityAbsenceFailure, match="pr2 has no RIGHT arm"):
-            await action(part, Arms.RIGHT).perform()
-    assert scene.world.save_state() == before
-    await OpenActionPerformable(part, Arms.LEFT).perform()
-    check(scene, SINK, SINK.goal)
-
-
 async def test_a_plan_continues_with_the_next_arm(scene: Scene, one_armed: None) -> None:
     part = await SINK.base_placed_by(scene)
     right, left = OpenAction(part, [Arms.RIGHT]), OpenAction(part, [Arms.LEFT])
@@ -421,27 +409,6 @@ def test_objects_and_parts_without_a_joint_are_grasped_at_their_pose(scene: Scen
     scene.world.remove(scene.milk)
     with pytest.raises(PerceptionObjectNotInWorld, match="milk"):
         grasp_pose(scene.milk)
-
-
-def test_an_object_that_cannot_be_opened_is_refused_in_one_line(scene: Scene) -> None:
-    for part, message in (
-        (ObjectPart("kitchen_counter_surface", scene.kitchen), "no joint of kitchen moves kitchen_counter_surface"),
-        (scene.kitchen, "kitchen is not part of an object"),
-        (ObjectDesignator("milk", ObjectType.MILK, scene.milk), "milk is not part of an object"),
-    ):
-        with pytest.raises(EnvironmentManipulationImpossible, match=message) as caught:
-            handle_of(part)
-        assert caught.value.data[0] == part.name
-    with pytest.raises(UnknownLink, match=r"no link 'window'"):
-        handle_of(ObjectPart("window", scene.kitchen))
-    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
-    for position in (opened_position, closed_position):
-        with pytest.raises(EnvironmentManipulationImpossible, match="turning has no limits"):
-            position(handle_of(ObjectPart("flag", crane)))
-    assert math.isinf(crane.joint_limits("turning")[1])
-    scene.world.remove(scene.kitchen)
-    with pytest.raises(PerceptionObjectNotInWorld, match="kitchen is not an object of the world"):
-        handle_of(ObjectPart(DRAWER, scene.kitchen))
 
 
 # === opening poses ============================================================================================

@@ -46,62 +46,6 @@ from tests.plan.fakes import Around, Step, drawn, failing
 # --- errors of the reference system -----------------------------------------------------------------------------------
 
 
-async def test_a_failure_inside_an_inner_expression_fails_the_outer_one() -> None:
-    with pytest.raises(PlanFailure, match="b failed"):
-        await ((Step("a") + failing("b")) | Step("c")).perform()
-    with pytest.raises(PlanFailure, match="a failed"):
-        await ((failing("a") | Step("b")) + Step("c")).perform()
-
-
-async def test_an_expression_in_brackets_is_performed_in_the_order_as_written() -> None:
-    log: list[str] = []
-    a, b, c, d = (Step(name, log) for name in "abcd")
-    await (a + (b + (c + d))).perform()
-    assert "".join(log) == "aa.bb.cc.dd."
-
-
-async def test_a_repetition_continues_after_failed_rounds_and_returns_them() -> None:
-    rounds = 0
-
-    def fails_in_two_and_four() -> int:
-        nonlocal rounds
-        rounds += 1
-        if rounds in (2, 4):
-            raise ObjectLost(f"gone in {rounds}")
-        return rounds
-
-    with pytest.raises(PlanFailures) as caught:
-        await (Code(fails_in_two_and_four) * 5).perform()
-    assert rounds == 5
-    assert str(caught.value) == "2 of 5 rounds failed (2, 4): ObjectLost: gone in 2; ObjectLost: gone in 4"
-    with pytest.raises(ObjectLost, match="gone in 2") as single_failure:
-        rounds = 0
-        await (Code(fails_in_two_and_four) * 3).perform()
-    assert single_failure.value.__notes__ == ["this was round 2 of 3; the others succeeded"]
-    assert await (Code(int) * 0).perform() == Outcome(rounds=0)
-
-
-async def test_every_branch_performs_its_own_operand() -> None:
-    outcome = await Parallel(*(Step(str(number), turns=5 - number) for number in range(5))).perform()
-    assert outcome == Outcome(("0", "1", "2", "3", "4"), (0, 1, 2, 3, 4))
-
-
-async def test_expressions_are_nodes_with_those_of_their_operands_below() -> None:
-    with collected_tree() as tree:
-        await ((Step("a") + failing("b") - Step("c")) | Step("d") * 2).perform()
-    assert drawn(tree) == [
-        "Parallel SUCCEEDED",
-        "├── TryInOrder SUCCEEDED",
-        "│   ├── Sequential FAILED (PlanFailure)",
-        "│   │   ├── Step SUCCEEDED",
-        "│   │   └── Step FAILED (PlanFailure)",
-        "│   └── Step SUCCEEDED",
-        "└── Repeat SUCCEEDED",
-        "    ├── Step SUCCEEDED",
-        "    └── Step SUCCEEDED",
-    ]
-
-
 # --- outcomes ---------------------------------------------------------------------------------------------------------
 
 

@@ -7,7 +7,6 @@ import itertools
 import random
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
 
 import pytest
 
@@ -43,7 +42,7 @@ from pycrorm_async.plan import (
     TryAll,
     collected_tree,
 )
-from pycrorm_async.plan.failures import ResourceDeadlock, ResourcesNotAMethod
+from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Pose, WorldMode
 from pycrorm_async.world.bullet import current_world
 from tests.plan.conftest import Scene
@@ -463,13 +462,3 @@ def test_a_users_action_requires_nothing_by_default() -> None:
         async def perform(self) -> None: ...
 
     assert needs(Thinking()) == set()
-
-
-def test_a_field_with_the_name_of_the_method_is_refused_when_the_class_is_made() -> None:
-    with pytest.raises(ResourcesNotAMethod, match=r"Cooking\.resources must be a method that returns a frozenset"):
-
-        @dataclass
-        class Cooking(ActionAbstract):
-            resources: list[str] = field(default_factory=list)  # type: ignore[assignment]  # what is refused
-
-            async def perform(self) -> None: ...

@@ -204,19 +204,3 @@ async def test_a_search_without_usable_experience_is_recorded_too(scene: Scene) 
         [],
         ["an obstacle is nearer than 0.3 m"],
     ]
-
-
-async def test_a_loop_over_candidates_is_recorded_once_at_its_end(scene: Scene) -> None:
-    location = location_from(scene, Known(HIDDEN, GOOD, OTHER))
-    with Recording().listening() as recording:
-        places = [place async for place in location]
-        async for place in location:
-            if place.torso_height == 0.3:
-                break
-        assert len(recording.places) == 2
-    all_of_them = tuple(map(candidate, places))
-    assert [each.torso_height for each in all_of_them] == [0.3, 0.2]
-    assert recording.places == [
-        ("DatabaseCostmapLocation", all_of_them, None, 3, None),
-        ("DatabaseCostmapLocation", all_of_them[:1], 0, 2, None),
-    ]

@@ -21,12 +21,11 @@ from pycrorm_async.plan import (
     PlaceAction,
     SemanticCostmapLocation,
     TaskStatus,
-    simulated_robot,
 )
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.plan.language import ActionAbstract, BaseMotion
 from pycrorm_async.plan.task import TaskTreeNode, collected_tree, current_node
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldMode
+from pycrorm_async.world import Arms, Grasp, Pose
 from tests.plan.conftest import Scene
 from tests.plan.fakes import Recording
 
@@ -225,43 +224,11 @@ async def test_the_thesis_plan_puts_the_cereal_on_the_island(scene: Scene) -> No
     assert {node.status for node in tree} == {TaskStatus.SUCCEEDED}
 
 
-async def test_a_recorder_is_notified_of_the_whole_thesis_plan(scene: Scene) -> None:
-    with Recording().listening() as recording:
-        await thesis_plan()
-    assert len(recording.ended) == len(TREE.splitlines()) == 22
-    assert recording.open == []
-    assert [each for each in recording.notes if each.startswith("place")] == [
-        "place CostmapLocation",
-        "place SemanticCostmapLocation",
-        "place CostmapLocation",
-    ]
-    assert all((taken, len(candidates)) == (0, 1) for _, candidates, taken, _, _ in recording.places)
-
-
 class Alternating(Recording):
     """Let other tasks run before every node."""
 
     def admit(self) -> Awaitable[None]:
         return asyncio.sleep(0)
-
-
-async def test_three_concurrent_plans_in_three_worlds_do_not_mix() -> None:
-    async def run_once() -> tuple[float, str]:
-        with BulletWorld(mode=WorldMode.DIRECT), simulated_robot, collected_tree() as tree:
-            Object("pr2", ObjectType.ROBOT)
-            Object("kitchen", ObjectType.ENVIRONMENT)
-            cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
-            await all_ready.wait()
-            goal = await thesis_plan()
-            return cereal.pose.distance(goal), re.sub(r" SUCCEEDED \d+\.\d ms", "", str(tree))
-
-    all_ready = asyncio.Barrier(3)
-    with Alternating().listening() as recording:
-        for distance, tree in await asyncio.gather(run_once(), run_once(), run_once()):
-            assert distance < 0.01
-            assert tree == TREE
-    assert recording.notes[:3] == ["start ParkArmsActionPerformable"] * 3
-    assert [node.parent for node in recording.ended].count(None) == 3 * 8
 
 
 async def test_two_runs_of_the_plan_are_the_same(scene: Scene) -> None:

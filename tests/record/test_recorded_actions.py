@@ -25,7 +25,6 @@ from pycrorm_async.orm import (
     Motion,
     ProcessMetaData,
     Repeat,
-    Retry,
     Sequential,
     TaskTreeNode,
 )
@@ -35,35 +34,26 @@ from pycrorm_async.orm import LocatedObject as LocatedObjectRow
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectPart as ObjectPartRow
 from pycrorm_async.plan import (
-    AccessingMotion,
     ActionAbstract,
     BelieveObject,
     CloseActionPerformable,
     DetectActionPerformable,
-    GripActionPerformable,
     LocatedObject,
     LookAtActionPerformable,
-    MoveTCPMotion,
     MoveTorsoAction,
     MoveTorsoActionPerformable,
     NavigateAction,
     NavigateActionPerformable,
     ObjectPart,
     OpenActionPerformable,
-    OpeningMotion,
-    PickUpActionPerformable,
     PlanFailure,
-    PlanFailures,
-    ReleaseActionPerformable,
-    TransportActionPerformable,
     WorldStateDetectingMotion,
     simulated_robot,
 )
 from pycrorm_async.plan import Code as Calling
 from pycrorm_async.plan import Designator as PlanDesignator
 from pycrorm_async.plan import Monitor as Watching
-from pycrorm_async.plan import Retry as Trying
-from pycrorm_async.plan.failures import EnvironmentManipulationImpossible, ObjectLost, PerceptionObjectNotFound
+from pycrorm_async.plan.failures import PerceptionObjectNotFound
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Object, ObjectType, Pose
@@ -78,7 +68,6 @@ pytestmark = pytest.mark.slow
 # The actions of hands and cameras are in the tables of a real memory, with the node that performed them.
 
 HANDLE, JOINT = "sink_area_drawer_handle", "sink_area_drawer_joint"
-LEFT_TOOL = "l_gripper_tool_frame"
 
 
 class Recorded(NamedTuple):
@@ -153,38 +142,6 @@ async def test_an_opened_and_a_closed_drawer_are_recorded_with_their_joints(reco
     assert await recorded.rows(select(orm.Attachment)) == []
 
 
-async def test_a_drawer_that_is_moved_by_a_distance_is_recorded(recorded: Recorded) -> None:
-    await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
-    await MoveTorsoActionPerformable(0.1).perform()
-    await MoveTCPMotion(Pose([1.0, 1.3, 0.665]), Arms.LEFT).perform()
-    await AccessingMotion(recorded.kitchen, Arms.LEFT, LEFT_TOOL, JOINT, HANDLE, 0.2).perform()
-    row = await recorded.only(select(orm.AccessingMotion))
-    assert (row.object.name, row.part_of.name, row.arm, row.gripper) == ("kitchen", "kitchen", Arms.LEFT, LEFT_TOOL)
-    assert (row.drawer_joint, row.drawer_handle, row.distance) == (JOINT, HANDLE, 0.2)
-    change = await recorded.only(select(orm.JointChange).where(orm.JointChange.joint == JOINT))
-    assert (change.node_id, change.position) == (row.id, pytest.approx(0.2))
-
-
-async def test_an_attached_and_a_detached_object_are_recorded(recorded: Recorded) -> None:
-    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
-    await MoveTCPMotion(Pose([1.3, 1, 0.9]), Arms.LEFT).perform()
-    await GripActionPerformable(Arms.LEFT, recorded.milk, 12.5).perform()
-    await MoveTCPMotion(Pose([1.2, 1.1, 1.0]), Arms.LEFT).perform()
-    await ReleaseActionPerformable(Arms.LEFT, recorded.milk).perform()
-    grip, release = await recorded.only(select(orm.GripAction)), await recorded.only(select(orm.ReleaseAction))
-    assert (grip.gripper, grip.effort, grip.object.name, grip.object.pose.position.x) == (Arms.LEFT, 12.5, "milk", 1.3)
-    assert (release.gripper, release.object.name) == (Arms.LEFT, "milk")
-    position = release.object.pose.position
-    assert (position.x, position.y, position.z) == pytest.approx((1.2, 1.1, 1.0), abs=1e-6)
-    attachments = await recorded.rows(select(orm.Attachment).order_by(orm.Attachment.id))
-    assert [(each.kind, each.parent.name, each.child.name, each.link, each.node_id) for each in attachments] == [
-        ("attached", "pr2", "milk", LEFT_TOOL, grip.id),
-        ("detached", "pr2", "milk", LEFT_TOOL, release.id),
-    ]
-    motions = await recorded.rows(select(orm.MoveGripperMotion).order_by(orm.MoveGripperMotion.id))
-    assert [each.motion for each in motions] == [GripperState.CLOSE, GripperState.OPEN]
-
-
 async def test_detections_and_failed_searches_are_recorded(recorded: Recorded) -> None:
     second = Object("second", ObjectType.MILK, pose=Pose([1.4, 1.3, 0.9]))
     await NavigateActionPerformable(Pose([0.2, 1, 0])).perform()
@@ -234,50 +191,6 @@ async def test_detections_and_failed_searches_are_recorded(recorded: Recorded) -
         assert seen.result is not None
 
 
-async def test_a_transported_object_is_recorded(recorded: Recorded) -> None:
-    goal = Pose([1.3, 0.5, 0.936])
-    await MoveTorsoActionPerformable(0.3).perform()
-    await TransportActionPerformable(recorded.milk, Arms.LEFT, goal).perform()
-    row = await recorded.only(select(orm.TransportAction))
-    assert (row.arm, row.object.name, row.object.pose.position.y) == (Arms.LEFT, "milk", 1.0)
-    assert (row.pose.position.x, row.pose.position.y, row.pose.position.z) == (1.3, 0.5, 0.936)
-    children = await recorded.rows(
-        select(orm.TaskTreeNode).where(orm.TaskTreeNode.parent_id == row.id).order_by(orm.TaskTreeNode.id)
-    )
-    assert [each.dtype for each in children] == [
-        "ParkArmsAction",
-        "NavigateAction",
-        "PickUpAction",
-        "ParkArmsAction",
-        "NavigateAction",
-        "PlaceAction",
-        "ParkArmsAction",
-    ]
-    attachments = await recorded.rows(select(orm.Attachment).order_by(orm.Attachment.id))
-    assert [(each.kind, each.node_id) for each in attachments] == [
-        ("attached", children[2].id),
-        ("detached", children[5].id),
-    ]
-    places = await recorded.rows(select(orm.LocationResolution).order_by(orm.LocationResolution.id))
-    assert [each.node_id for each in places] == [row.id, row.id]
-    moved = await recorded.rows(select(orm.Object).where(orm.Object.name == "milk").order_by(orm.Object.id))
-    last = moved[-1].pose.position
-    assert (last.x, last.y, last.z) == pytest.approx((1.3, 0.5, 0.936), abs=1e-6)
-
-
-async def test_a_failure_is_recorded_with_its_object_and_arm(recorded: Recorded) -> None:
-    with pytest.raises(EnvironmentManipulationImpossible):
-        await OpeningMotion(ObjectPart(HANDLE, recorded.kitchen), Arms.LEFT).perform()
-    node = await recorded.only(select(orm.TaskTreeNode).where(orm.TaskTreeNode.dtype == "OpeningMotion"))
-    assert node.reason == "EnvironmentManipulationImpossible"
-    message, handle, apart = node.failure_arguments
-    assert (message, handle) == (node.failure_message, HANDLE)
-    assert f"{apart:.3f} m away" in message
-    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
-    await PickUpActionPerformable(recorded.milk, Arms.RIGHT, Grasp.FRONT).perform()
-    assert len(await recorded.rows(select(orm.PickUpAction))) == 1
-
-
 # === language =================================================================================================
 #
 # Plans of the language in a memory: expressions with their fields, outcomes, failures and interruptions.
@@ -285,15 +198,6 @@ async def test_a_failure_is_recorded_with_its_object_and_arm(recorded: Recorded)
 
 def note(text: str) -> NoteActionPerformable:
     return NoteActionPerformable(text)
-
-
-class Lost(NoteActionPerformable):
-    async def perform(self) -> None:
-        raise ObjectLost(f"{self.text} is gone", self.text, 3)
-
-
-def spill(what: str, times: int) -> None:
-    raise PlanFailure(f"{what} spilled", times)
 
 
 async def every(memory: Memory | Reading, question: Any) -> list[Any]:
@@ -375,34 +279,6 @@ async def test_the_classes_of_actions_and_motions_return_no_expressions(tmp_path
             assert await session.scalar(select(func.count()).select_from(Action)) == 2
 
 
-async def test_several_failures_are_kept_with_class_message_and_arguments(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with pytest.raises(PlanFailures):
-            await (Lost("milk") | Calling(spill, what="juice", times=2) | note("c")).perform()
-        await memory.flush()
-        node = (await every(memory, select(TaskTreeNode).where(TaskTreeNode.dtype == "Parallel")))[0]
-        message = "2 of 3 branches failed: ObjectLost: milk is gone; PlanFailure: juice spilled"
-        assert (node.status, node.reason, node.failure_message) == (TaskStatus.FAILED, "PlanFailures", message)
-        milk = {"type": "ObjectLost", "message": "milk is gone", "arguments": ["milk is gone", "milk", 3]}
-        juice = {"type": "PlanFailure", "message": "juice spilled", "arguments": ["juice spilled", 2]}
-        assert node.failure_arguments == [message, [milk, juice]]
-        (episode,) = await every(memory, select(ProcessMetaData))
-        assert episode.status == "FAILED"
-
-
-async def test_a_retry_keeps_its_attempts(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with pytest.raises(ObjectLost):
-            await Trying(Lost("milk"), max_tries=4).perform()
-        await memory.flush()
-        (retry,) = await every(memory, select(Retry))
-        assert retry.max_tries == 4
-        tries = await every(memory, select(TaskTreeNode).where(TaskTreeNode.parent_id == retry.id))
-        assert [(each.dtype, each.status, each.reason) for each in tries] == [
-            ("LostAction", TaskStatus.FAILED, "ObjectLost")
-        ] * 4
-
-
 async def test_an_interruption_is_recorded_as_one(tmp_path: Path) -> None:
     begun = asyncio.Event()
 
@@ -429,17 +305,6 @@ async def test_an_interruption_is_recorded_as_one(tmp_path: Path) -> None:
         assert monitor.condition == "asyncio.locks.Event"
         (episode,) = await every(memory, select(ProcessMetaData))
         assert episode.status == "SUCCEEDED"
-
-
-async def test_a_memory_opened_for_reading_has_the_expressions(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        await (note("a") * 3).perform()
-        await memory.flush()
-    async with Reading.open(url_of(tmp_path)) as reading:
-        (repeat,) = await every(reading, select(Repeat))
-        assert repeat.times == 3
-        frame = await reading.dataframe(select(Repeat.times, TaskTreeNode.status).join(Repeat.node))
-        assert frame.to_dict("list") == {"times": [3], "status": ["SUCCEEDED"]}
 
 
 # === object designators =======================================================================================

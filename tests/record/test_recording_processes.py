@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async import Memory, Settings, recover
+from pycrorm_async import Memory, Settings
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.rebuild import rebuild_memory
@@ -22,7 +22,7 @@ from tests.commands import environment, pycrorm, run_script
 from tests.databases import ask
 from tests.projections.event_script import Script, declarations, declared, field, name_of
 from tests.projections.sql_queries import stored_and_folded
-from tests.record.recordings import assert_verified, events, nodes, opened, url_of
+from tests.record.recordings import events, nodes, opened, url_of
 from tests.table_comparison import differences, tables_of
 from tests.writer.running_writers import Daemon
 
@@ -87,32 +87,6 @@ def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> Non
     assert done.stderr.startswith("a call of `start` leaves no record, because this process was forked"), done.stderr
     assert done.stderr.count("\n") == 1
     assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
-
-
-@pytest.mark.slow
-def test_what_was_written_before_a_kill_is_stored_by_the_next_memory(tmp_path: Path) -> None:
-    script = (
-        "import os, sys\n"
-        "from pycrorm_async import Memory\n"
-        "memory = Memory.sync(sys.argv[1]).__enter__()\n"
-        "episode = memory.recording.episode(description='d')\n"
-        "kind = memory.recording.type('action', 'Step', {'number': int})\n"
-        "for number in range(10**6):\n"
-        "    episode.start(number, kind, {'number': number})\n"
-        "    episode.end(number)\n"
-        "    os.write(1, b'%d\\n' % number)\n"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        announced = [int(process.stdout.readline()) for _ in range(500)]
-        process.kill()
-        announced += map(int, process.stdout.read().rpartition(b"\n")[0].split())
-    asyncio.run(recover(url_of(tmp_path)))
-    succeeded = "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED'"
-    assert set(announced) <= {number for (number,) in ask(tmp_path / "memory.db", succeeded)}
-    assert_verified(tmp_path)
 
 
 @pytest.mark.slow

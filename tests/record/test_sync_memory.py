@@ -16,11 +16,10 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import CallerError, DatabaseForeign, FlushTimeout, UnknownUrl
 from pycrorm_async.memory import SyncMemory
 from pycrorm_async.orm import TaskTreeNode
-from pycrorm_async.record.declarations import FieldSpec
 from pycrorm_async.world.pose import Pose
 from tests.commands import environment
 from tests.databases import ask, ask_to_change
-from tests.record.recordings import nodes, problems, url_of
+from tests.record.recordings import nodes, url_of
 
 
 def step(memory: SyncMemory) -> None:
@@ -148,21 +147,3 @@ def test_a_program_that_never_closes_its_memory_ends_and_loses_nothing(tmp_path:
             time.sleep(0.01)
         memory.flush()
     assert len(nodes(tmp_path)) == 1
-
-
-@pytest.mark.slow
-def test_both_databases_have_the_same_tables_of_an_episode(database_url: str, tmp_path: Path) -> None:
-    with Memory.sync(database_url, spool=tmp_path / "spool") as memory:
-        fields: dict[str, FieldSpec] = {"object_designator": "object", "at": Pose, "words": ("list", "text")}
-        kind = memory.recording.type("action", "GripAction", fields)
-        with memory.recording.episode(description="d") as episode:
-            urdf = "<robot name='milk'><link name='box'/></robot>"
-            episode.object_added("m", "milk", "MILK", Pose([1, 2, 3]), {"lid": 0.5}, urdf=urdf)
-            episode.start("a", kind, {"object_designator": "m", "at": Pose([1, 0, 0]), "words": ["x", "y"]}, robot="m")
-            episode.observe("force", {"x": 1.5}, node="a")
-            episode.end("a", "FAILED", "slipped")
-        memory.flush()
-        assert (memory.status.faults.total, memory.status.missing.total) == (0, 0)
-        frame = memory.dataframe(select(TaskTreeNode.dtype, TaskTreeNode.status, TaskTreeNode.robot))
-    assert [tuple(row) for row in frame.itertuples(index=False)][1:] == [("GripAction", "FAILED", "milk")]
-    assert problems(database_url) == []

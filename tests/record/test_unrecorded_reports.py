@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import logging
-import subprocess
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +15,6 @@ import pytest
 from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import ActionAbstract
-from tests.commands import environment
 from tests.databases import ask, put_memory
 
 
@@ -88,51 +85,6 @@ async def test_the_status_of_a_closed_memory_is_its_last(tmp_path: Path, writer:
     status = memory.status
     assert (status.written, status.synced) == (written, written)
     assert status.stored == (written if writer == "thread" else 0)
-
-
-@pytest.mark.soak
-@pytest.mark.slow
-def test_a_forked_child_goes_on_without_recording_and_its_status_counts(tmp_path: Path) -> None:
-    script = (
-        "import asyncio, os, sys, warnings\n"
-        "from tests.record.test_unrecorded_reports import Memory, StepActionPerformable\n"
-        "async def in_child(memory):\n"
-        "    for number in range(2):\n"
-        "        await StepActionPerformable(number).perform()\n"
-        "    memory.observe('force', 5)\n"
-        "    with memory.recording.episode(description='in the child') as episode:\n"
-        "        episode.start(1, memory.recording.type('action', 'Step'))\n"
-        "    try:\n"
-        "        async with memory.episode():\n"
-        "            pass\n"
-        "    except Exception as error:\n"
-        "        print(type(error).__name__, error)\n"
-        "    print(memory.status.unrecorded, memory.is_open)\n"
-        "async def main():\n"
-        "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='parent'):\n"
-        "        child = os.fork()\n"
-        "        if child == 0:\n"
-        "            await in_child(memory)\n"
-        "            sys.stdout.flush()\n"
-        "            os._exit(0)\n"
-        "        os.waitpid(child, 0)\n"
-        "        await StepActionPerformable(7).perform()\n"
-        "    print(memory.status.unrecorded)\n"
-        "asyncio.run(main())\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script, put_memory(tmp_path / "memory.db")],
-        env=environment(), capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == [
-        "CallerError this memory is open in the process that forked this one: open another one here",
-        "5 False",
-        "0",
-    ]
-    assert done.stderr.count("\n") == 1
-    assert "because this process was forked from the one that opened the memory" in done.stderr
-    assert ask(tmp_path / "memory.db", "SELECT number FROM step_action") == [(7,)]
 
 
 async def test_a_list_that_lags_says_how_many_episodes_are_being_folded(tmp_path: Path) -> None:
