@@ -38,7 +38,7 @@ from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Protocol, TypeAlias, final, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, final, get_args
 
 import msgspec
 from sqlalchemy import Dialect
@@ -348,12 +348,6 @@ Refused: TypeAlias = tuple[int, Exception]
 """The first event that a fold cannot read, by its sequence, with the exception."""
 
 
-class _Read(Protocol):
-    """Gives events of one episode to a fold; discards the results if `kept` is False."""
-
-    def __call__(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None: ...
-
-
 @dataclass(slots=True)
 class _OpenFold:
     """The fold of one episode after its event `reached`; `fault` is the reason why it could not be restored."""
@@ -396,64 +390,6 @@ class EpisodeFolds:
         return len(self._open)
 
 
-class BatchOfFolds:
-    """The folds of the episodes of one batch.
-
-    Args:
-        folds: those that earlier batches left.
-        read: gives events to a fold.
-    """
-
-    def __init__(self, folds: EpisodeFolds, read: _Read) -> None:
-        self._folds = folds
-        self._read = read
-        self._taken: dict[int, _OpenFold] = {}
-
-    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Bring the fold of each episode to the event before its span."""
-        for span in spans:
-            fold = self._folds.take(span.number)
-            if fold is None or fold.reached > span.after:
-                fold = _OpenFold(self._folds.projection.episode())
-            self._taken[span.number] = fold
-            while fold.reached < span.after and fold.fault is None:
-                page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
-                fold.fault = self._read_again(fold, await log.spans([page]), page.last)
-
-    def fold(self, events: Sequence[StoredEvent]) -> Refused | None:
-        """Give the next events of an episode to its fold, which is dropped if it cannot fold one of them."""
-        first = events[0]
-        taken = self._taken.get(first.number)
-        if taken is None:
-            assert first.sequence == 1, "a batch that continues an episode restores its fold first"
-            taken = self._taken[first.number] = _OpenFold(self._folds.projection.episode())
-        if taken.fault is not None:
-            refused: Refused | None = (first.sequence, CannotFold(taken.fault))
-        else:
-            refused = self._read(taken.fold, events)
-        if refused is None:
-            taken.advance(events)
-        else:
-            del self._taken[first.number]
-        return refused
-
-    def give_back(self) -> None:
-        """Keep the folds for the next batch."""
-        while self._taken:
-            self._folds.keep(*self._taken.popitem())
-
-    def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
-        """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
-        whole = consecutive(events, fold.reached)
-        if whole and (refused := self._read(fold.fold, whole, kept=False)) is not None:
-            sequence, fault = refused
-            raised = "" if isinstance(fault, CannotFold) else f"{type(fault).__name__}: "
-            return f"event {sequence}, read again: {raised}{fault}"
-        if whole:
-            fold.advance(whole)
-        return None if fold.reached == last else f"event {fold.reached + 1} is missing in the log"
-
-
 # === packed projection ========================================================================================
 #
 # Define projections that pack many rows of a fold into one row of a table.
@@ -492,7 +428,7 @@ class ProjectedBatch(ABC):
     Args:
         projection: to fold with.
         declared: designator types by fingerprint.
-        folds: of an `EpisodeProjection`, those of the episodes that earlier batches began.
+        folds: of an `EpisodeProjection`, those of the episodes that earlier batches began; None for other projections.
     """
 
     def __init__(
@@ -505,23 +441,49 @@ class ProjectedBatch(ABC):
         self._declared = declared
         reads = projection.reads
         self._reads = None if reads is None else frozenset(each.__name__ for each in reads)
-        self._folds: BatchOfFolds | None = None
-        if isinstance(projection, EpisodeProjection):
-            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._read)
+        self._folds = folds
+        self._taken: dict[int, _OpenFold] = {}
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Restore the folds of the episodes that this batch continues."""
-        if self._folds is not None:
-            await self._folds.restore(log, spans)
+        """Bring the fold of each episode that has a state to the event before its span."""
+        if (folds := self._folds) is None:
+            return
+        for span in spans:
+            fold = folds.take(span.number)
+            if fold is None or fold.reached > span.after:
+                fold = _OpenFold(folds.projection.episode())
+            self._taken[span.number] = fold
+            while fold.reached < span.after and fold.fault is None:
+                page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
+                fold.fault = self._read_again(fold, await log.spans([page]), page.last)
 
     def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
-        """Fold consecutive events of an episode, and add the results to the batch; implements `Batch.fold`."""
-        refused = self._read(self._projection.fold, events) if self._folds is None else self._folds.fold(events)
+        """Give the next events of an episode to its fold, which is dropped if it cannot fold one; see `Batch.fold`."""
+        first, folds = events[0], self._folds
+        fold = self._taken.get(first.number)
+        if fold is None:
+            assert folds is None or first.sequence == 1, "a batch that continues an episode restores its fold first"
+            fold = _OpenFold(self._projection.fold if folds is None else folds.projection.episode())
+            self._taken[first.number] = fold
+        refused = self._read(fold.fold, events) if fold.fault is None else (first.sequence, CannotFold(fold.fault))
         if refused is None:
+            fold.advance(events)
             return None
+        del self._taken[first.number]
         sequence, fault = refused
         raised = "" if isinstance(fault, CannotFold) else f"{self._projection.name} raised {type(fault).__name__}: "
         return sequence, f"{raised}{fault}"
+
+    def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
+        """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
+        whole = consecutive(events, fold.reached)
+        if whole and (refused := self._read(fold.fold, whole, kept=False)) is not None:
+            sequence, fault = refused
+            raised = "" if isinstance(fault, CannotFold) else f"{type(fault).__name__}: "
+            return f"event {sequence}, read again: {raised}{fault}"
+        if whole:
+            fold.advance(whole)
+        return None if fold.reached == last else f"event {fold.reached + 1} is missing in the log"
 
     def _read(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None:
         reads = self._reads
@@ -537,7 +499,8 @@ class ProjectedBatch(ABC):
     async def ready(self, engine: AsyncEngine, generation: int) -> None:  # noqa: ARG002 - for subclasses
         """Leave the folds of the episodes to the next batch. Subclasses prepare their statements, too."""
         if self._folds is not None:
-            self._folds.give_back()
+            while self._taken:
+                self._folds.keep(*self._taken.popitem())
 
     @abstractmethod
     async def write(self, connection: AsyncConnection, generation: int) -> None:
