@@ -8,7 +8,6 @@ import itertools
 import random
 import shutil
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -42,7 +41,7 @@ from tests.operations.memories import (
 from tests.projections.event_script import Script, append_and_fold, declarations, declared, field, name_of
 from tests.projections.rebuild_cases import traces
 from tests.store.factories import episode, record, run_of
-from tests.table_comparison import Logs, declarations_of, differences, logs_of, tables_of
+from tests.table_comparison import Logs, logs_of, tables_of
 
 pytestmark = pytest.mark.slow
 
@@ -542,21 +541,3 @@ async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_h
     assert (done.generation, done.parked, done.left) == (1002, {}, [])
     assert_merged(target, one, other)
     assert traces(target) == []
-
-
-@pytest.mark.soak
-async def test_earlier_rebuilds_of_the_sources_make_no_difference(new_url: NewUrl, new_file: NewUrl) -> None:
-    one, other, target = await merged(new_file, new_url, lambda url: random_plans(url, range(6)))
-    before = tables_of(target)
-    for each in (one, other):
-        assert (await rebuild_memory(each)).generation == 1002
-    again, at_last = new_url(), new_file()
-    for source in (one, other):
-        await copy_episodes(source, again)
-    await rebuild_memory(again)
-    await copy_episodes(again, at_last)
-    await rebuild_memory(at_last)
-    for here, there in pairwise([target, again, at_last]):
-        assert declarations_of(here) == declarations_of(there)
-        assert differences(tables_of(here), tables_of(there)) == []
-    assert differences(before, tables_of(at_last)) == []

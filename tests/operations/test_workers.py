@@ -418,21 +418,6 @@ async def test_an_exception_of_a_worker_is_reported_and_it_continues_to_fold(
 
 
 @pytest.mark.usefixtures("forked_workers")
-@pytest.mark.soak_on("postgresql")
-async def test_status_keeps_the_batch_count_of_a_worker_that_has_ended(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async with lab_at(database_url, tmp_path, PATIENT, monkeypatch) as lab:
-        before = lab.worker().batches
-        for _ in range(3):
-            await lab.write()
-            await lab.memory.flush()
-        async with asyncio.timeout(20):
-            while lab.worker().batches < before + 3:  # noqa: ASYNC110
-                await asyncio.sleep(0.01)
-
-
-@pytest.mark.usefixtures("forked_workers")
 async def test_a_worker_refuses_to_fold_another_database_than_its_daemons(tmp_path: Path) -> None:
     fold = _RequestHandler(Assignment(f"sqlite:///{tmp_path}/memory.db", "another log", []))
     missing = await fold.answer(Write())

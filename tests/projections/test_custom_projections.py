@@ -6,7 +6,6 @@ import asyncio
 import os
 import re
 import signal
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -137,15 +136,6 @@ async def test_rows_do_not_depend_on_the_number_of_events_in_a_batch(log: EventL
     assert sorted(await ask(log, "SELECT arm, tries FROM grasp_tries_per_arm")) == [("LEFT", 6), ("RIGHT", 2)]
 
 
-async def test_rows_follow_event_by_event_as_the_daemon_folds(log: EventLog) -> None:
-    projector = await folded(log, [*declarations(PICK_UP), *tries().records[:4]], GraspRate())
-    assert [row[-1] for row in await visible_rows(log)] == ["SUCCEEDED"]
-    await log.append(tries().records)
-    while await projector.fold_next_batch():
-        pass
-    assert await visible_rows(log) == rows_of(1)
-
-
 async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,12 +173,6 @@ async def test_a_process_without_the_projection_leaves_it_and_one_with_it_catche
     assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
 
 
-async def test_a_projection_that_is_installed_later_begins_with_the_first_event_of_the_log(log: EventLog) -> None:
-    await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))])
-    await folded(log, [], GraspRate())
-    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
-
-
 @pytest.mark.parametrize(
     "payload",
     [b'{"version":2,"kind":"action"}', b"?", b'{"kind":"action","dtype":"XAction","table":7}', b"[" * 100_000],
@@ -201,20 +185,6 @@ async def test_an_unreadable_declaration_stops_nothing_else(log: EventLog, paylo
     await projector.open()
     await projector.catch_up()
     assert await ask(log, "SELECT * FROM grasp_try ORDER BY id") == rows_of(1)
-
-
-async def test_two_concurrent_processes_fold_every_event_once(log: EventLog) -> None:
-    records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 21)))]
-    await folded(log, records)
-    other = await EventLog.open(log.address, create=True)
-    try:
-        both = [Projector(each, projections=[GraspRate()], batch_events=1_000) for each in (log, other)]
-        for each in both:
-            await each.open()
-        await asyncio.gather(*(each.catch_up() for each in both))
-    finally:
-        await other.close()
-    assert Counter(await visible_rows(log)) == Counter(each for episode in range(1, 21) for each in rows_of(episode))
 
 
 async def test_a_batch_that_another_process_has_folded_meanwhile_is_not_written(log: EventLog) -> None:

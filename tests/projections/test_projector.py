@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import random
 
 import pytest
@@ -78,17 +77,6 @@ def rich_episode(number: int) -> Script:
     return script
 
 
-async def test_every_table_has_rows_after_every_kind_of_event(log: EventLog) -> None:
-    await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records])
-    filled = {name for name, rows in (await all_rows(log)).items() if rows}
-    assert filled == {
-        "zz_process_metadata__1001", "zz_task_tree_node__1001", "zz_pose__1001", "zz_object__1001",
-        "zz_object_removal__1001", "zz_attachment__1001", "zz_parameter_item__1001", "zz_joint_change__1001",
-        "zz_location_resolution__1001", "zz_location_candidate__1001", "zz_location_refusal__1001",
-        "zz_navigate_action__1001", "zz_pick_up_action__1001", "zz_via_action__1001",
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize(
     "batch_events", [1, *(pytest.param(size, marks=pytest.mark.soak) for size in (2, 3, 7)), 10_000]
 )
@@ -125,33 +113,10 @@ async def test_batches_of_any_size_make_the_same_rows(log: EventLog, batch_event
     }  # fmt: skip
 
 
-async def test_one_batch_and_event_by_event_make_the_same_tables(log: EventLog, tmp_path: object) -> None:
-    records = [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records]
-    await stored_and_folded(log, records)
-    in_own_loop = await all_rows(log)
-    other = await EventLog.open(type(log.address).parse(f"sqlite:///{tmp_path}/other.db"), create=True)
-    try:
-        projector = Projector(other)
-        await projector.open()
-        for record in records:
-            await other.append([record])
-            await projector.catch_up()
-        assert await all_rows(other) == in_own_loop
-    finally:
-        await other.close()
-
-
-async def test_without_unfolded_events_nothing_is_done(log: EventLog) -> None:
-    projector = await stored_and_folded(log, rich_episode(1).records[:2])
-    assert await projector.catch_up() == 0
-
-
 @pytest.mark.parametrize(
     ("bad", "reason"),
     [
         ("undeclared", "event 3: the designator type 00000000000000000000000000000000 was never declared"),
-        ("undecodable", "event 3: NodeEnded cannot be decoded: JSON is malformed: invalid character (byte 0)"),
-        ("unknown", "event 3: RobotDanced is not an event type of this version"),
         ("newer", "event 3: NodeEnded has version 2, this version reads 1"),
         (
             "taken",
@@ -174,10 +139,6 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_c
     match bad:
         case "undeclared":
             first.put(NodeStarted("action", 2, "0" * 32))
-        case "undecodable":
-            first.put_payload("NodeEnded", b"?")
-        case "unknown":
-            first.put_payload("RobotDanced", b"{}")
         case "newer":
             first.put(NodeEnded(2, "SUCCEEDED"), version=2)
         case "taken":
@@ -254,35 +215,6 @@ async def test_a_descendant_is_listed_with_its_base_even_if_the_base_was_declare
         (row(2), None, "RIGHT", 1, 2),
     ]
     assert await ask(log, "SELECT * FROM careful_grab_action") == [(row(1), None, "LEFT", 0.5, 1, 1)]
-
-
-@pytest.mark.soak_on("sqlite")
-async def test_several_projectors_fold_every_event_once(log: EventLog) -> None:
-    projectors = [Projector(log, batch_events=5) for _ in range(4)]
-    for each in projectors:
-        await each.open()
-    episodes = [rich_episode(number) for number in range(1, 9)]
-    await log.append([*declarations(NAVIGATE, PICK_UP, VIA), *mixed(*episodes)])
-    counts = await asyncio.gather(*(each.catch_up() for each in projectors))
-    assert sum(counts) == 8 * 17
-    assert await ask(
-        log, "SELECT count(*), sum(CASE WHEN status = 'SUCCEEDED' THEN 1 ELSE 0 END) FROM task_tree_node"
-    ) == [(32, 24)]
-    assert await ask(log, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
-
-
-async def test_a_projector_with_older_tables_learns_the_new_ones(log: EventLog) -> None:
-    first, second = Projector(log), Projector(log)
-    await first.open()
-    await second.open()
-    script = Script()
-    script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
-    await log.append([*declarations(SAYING), *script.records])
-    assert await first.catch_up() == 1
-    script.put(NodeStarted("action", None, name_of(SAYING), {"text": "ho"}))
-    await log.append(script.records)
-    assert await second.catch_up() == 1
-    assert await ask(log, "SELECT text FROM saying_action ORDER BY id") == [("hi",), ("ho",)]
 
 
 async def test_views_leave_a_simulation_out_and_tables_hold_it(log: EventLog) -> None:

@@ -174,13 +174,6 @@ async def test_missing_tables_are_made(database_url: str) -> None:
     assert traces(database_url) == []
 
 
-@pytest.mark.soak  # crash/test_rebuild_kill folds and reads beside rebuilds too
-async def test_events_folded_beside_rebuilds_are_in_the_tables_and_no_reader_misses_anything(
-    database_url: str, tmp_path: Path
-) -> None:
-    await fold_beside(database_url, tmp_path, rebuilds=2)
-
-
 @pytest.mark.soak
 async def test_events_folded_beside_many_rebuilds_are_in_the_tables(
     database_url: str, tmp_path: Path, in_turn: bool
@@ -300,19 +293,6 @@ async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatc
     assert done.generation == 1002
     assert differences(before, tables_of(database_url)) == []
     assert traces(database_url) == []
-
-
-@pytest.mark.soak
-async def test_the_size_of_batches_does_not_change_the_tables(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    await every_kind_of_episode(database_url, tmp_path / "spool")
-    before, stopped = tables_of(database_url), ask(database_url, STOPPED)
-    monkeypatch.setattr(steps, "_BATCH_EVENTS", 7)
-    done = await rebuild_memory(database_url)
-    assert differences(before, tables_of(database_url)) == []
-    assert ask(database_url, STOPPED) == stopped
-    assert (list(done.parked), traces(database_url)) == ([str_of(10)], [])
 
 
 @pytest.mark.soak_on("postgresql")

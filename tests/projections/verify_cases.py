@@ -156,8 +156,10 @@ def findings(result: VerifyResult) -> tuple[Any, ...]:
 
 
 async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:
+    """Verify in parts of about as many events, read in pages of so many."""
     with monkeypatch.context() as patched:
         patched.setattr(parts, "_PART_EVENTS", events)
+        patched.setattr(parts, "_PAGE_EVENTS", events)
         return await look(log)
 
 

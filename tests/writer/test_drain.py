@@ -126,18 +126,6 @@ async def test_a_drain_with_limited_retries_raises_and_its_source_keeps_everythi
     assert source.given_up == [f"the writer stopped: {log.address}: database is locked"]
 
 
-async def test_a_copied_state_does_not_change(log: EventLog) -> None:
-    drain = Drain(
-        KeptSource([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9)], closed=True),
-        log.append,
-        settings=TENS,
-    )
-    before = drain.state
-    await drain.run()
-    assert drain.state.refused == {name(1): "event 5 did not arrive before event 6"}
-    assert before.refused == {}
-
-
 async def test_refused_records_become_dead_letters_before_they_are_acknowledged_and_the_others_are_stored(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -426,20 +414,6 @@ async def test_one_round_stores_folds_and_reports_all_records(log: EventLog) -> 
     assert [each.kept for each in sources] == [[], []]
 
 
-async def test_a_round_without_records_does_nothing(log: EventLog) -> None:
-    recovered = await drain_once([], CountingFold(log), settings=SETTINGS)
-    assert (recovered.drained, recovered.folded) == ((), 0)
-
-
-async def test_records_that_are_already_stored_are_counted_once(log: EventLog) -> None:
-    await log.append(run_of(episode(1), 1, 12))
-    recovered = await drain_once(
-        [KeptSource(run_of(episode(1), 1, 15), closed=True)], CountingFold(log), settings=SETTINGS
-    )
-    assert recovered.folded == 15
-    assert ask(log.address.path, "SELECT count(*) FROM event") == [(15,)]
-
-
 async def test_a_damaged_source_is_reported_and_the_others_are_drained(log: EventLog) -> None:
     class Damaged(KeptSource):
         async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
@@ -477,18 +451,6 @@ async def test_a_refusal_without_dead_letters_is_a_failure_of_its_source(log: Ev
     }
     assert list(recovered.stopped.values()) == ["event 4 did not arrive before event 5"]
     assert (full.kept, healthy.kept) == ([1, 2, 3, 5, 6], [])
-
-
-@pytest.mark.slow
-@pytest.mark.every_python
-async def test_a_database_that_stays_unavailable_is_raised(log: EventLog) -> None:
-    holder = sqlite3.connect(log.address.path, isolation_level=None)
-    holder.execute("BEGIN IMMEDIATE")
-    source = KeptSource(run_of(episode(1), 1, 3), closed=True)
-    with pytest.raises(DatabaseUnavailable, match="database is locked"):
-        await drain_once([source], CountingFold(log), settings=SETTINGS)
-    holder.close()
-    assert source.kept == [1, 2, 3]
 
 
 class LockedAfterAppend(ForwardingDestination):
@@ -550,20 +512,18 @@ async def test_a_query_for_stopped_episodes_on_an_unavailable_database_is_retrie
 # === retry ====================================================================================================
 
 
-def test_each_pause_is_twice_the_previous_one_up_to_the_longest() -> None:
+@pytest.mark.parametrize(
+    ("attempts", "randomness", "pauses_s"),
+    [
+        ((1, 2, 3, 4, 5, 10**9), 1.0, [0.5, 1.0, 2.0, 4.0, 5.0, 5.0]),
+        ((3,), 0.0, [1.0]),
+        ((3,), 0.5, [1.5]),
+    ],
+)
+def test_pauses_double_up_to_the_longest_and_jitter_takes_up_to_half(
+    attempts: Sequence[int], randomness: float, pauses_s: list[float]
+) -> None:
     backoff = Backoff(first_s=0.5, longest_s=5.0)
-    assert [backoff.pause_s(attempt, 1.0) for attempt in range(1, 7)] == [0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
-
-
-def test_jitter_takes_up_to_half_of_a_pause() -> None:
-    backoff = Backoff(first_s=0.5, longest_s=5.0)
-    assert [backoff.pause_s(3, randomness) for randomness in (0.0, 0.5, 1.0)] == [1.0, 1.5, 2.0]
-
-
-def test_a_policy_without_a_last_attempt_continues_for_years() -> None:
-    assert Backoff(first_s=0.5, longest_s=5.0).pause_s(10**9, 1.0) == 5.0
-
-
-def test_a_policy_with_a_last_attempt_ends_at_it() -> None:
-    backoff = Backoff(first_s=1.0, longest_s=5.0, attempts_max=3)
-    assert [backoff.pause_s(attempt, 1.0) for attempt in (1, 2, 3, 4)] == [1.0, 2.0, None, None]
+    assert [backoff.pause_s(each, randomness) for each in attempts] == pauses_s
+    limited = Backoff(first_s=0.5, longest_s=5.0, attempts_max=1)
+    assert limited.pause_s(1, randomness) is None

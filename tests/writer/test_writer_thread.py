@@ -20,7 +20,7 @@ from pycrorm_async.writer.drain import Destination
 from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask
 from tests.store.factories import declaration, episode, name, record, run_of
-from tests.writer.fakes import ForwardingDestination, KeptSource, LosesReplies, opener
+from tests.writer.fakes import ForwardingDestination, KeptSource, opener
 from tests.writer.running_writers import (
     NEVER_IDLE,
     QUICK,
@@ -94,19 +94,6 @@ async def test_events_left_unfolded_by_a_predecessor_are_folded_when_the_new_pla
     await until_answer(address.path, HEADS, [(name(1), 7, 7)])
     source.close()
     await writer.close()
-
-
-async def test_a_commit_whose_reply_is_lost_beside_a_plan_is_stored_once(address: DatabaseAddress) -> None:
-    source = KeptSource(run_of(episode(1), 1, 1500))
-    writer = WriterThread(
-        source=source, open_destination=opener(address, around=LosesReplies), adopt=no_writer_alive, settings=NEVER_IDLE
-    )
-    await writer.start()
-    await writer.flush(1500)
-    assert writer.state.queue.retries == 2
-    source.close()
-    await writer.close()
-    assert ask(address.path, "SELECT count(*), max(sequence) FROM event") == [(1500, 1500)]
 
 
 # --- opening --------------------------------------------------------------------------------------------------
