@@ -10,8 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from sqlalchemy import Table, func, inspect, select
-from sqlalchemy.ext.asyncio import AsyncSession
+from sqlalchemy import Table, inspect, select
 
 import pycrorm_async.orm
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
@@ -55,13 +54,15 @@ PERFORMABLES = [
     if isinstance(each, type) and issubclass(each, ActionAbstract | BaseMotion) and each.__module__ == module.__name__
     if not isabstract(each)
 ]
+EXPRESSIONS = [Sequential, TryInOrder, Parallel, TryAll, Repeat, Monitor, Code, Retry]
+ROOTS = {"action": Action, "motion": Motion, "language": Language}
 
 
-@pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)
-def test_every_action_and_motion_has_a_mapped_class(designator: type) -> None:
+@pytest.mark.parametrize("designator", [*PERFORMABLES, *EXPRESSIONS], ids=lambda each: each.__name__)
+def test_every_designator_has_a_mapped_class_into_whose_table_it_fits(designator: type) -> None:
     declaration = declared_type(designator).declaration
     mapped = getattr(pycrorm_async.orm, declaration.dtype)
-    assert issubclass(mapped, Action if declaration.kind == "action" else Motion)
+    assert issubclass(mapped, ROOTS[declaration.kind])
     assert mapped.__tablename__ == declaration.table
     table = inspect(mapped).local_table
     assert isinstance(table, Table)
@@ -78,12 +79,7 @@ def test_every_action_and_motion_has_a_mapped_class(designator: type) -> None:
         if first is not None:
             assert getattr(mapped, f"{kind}_id").property.columns[0].name == first.column
             assert hasattr(mapped, kind)
-
-
-@pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)
-def test_every_declaration_of_a_plan_fits_into_the_tables_of_the_classes(designator: type) -> None:
     layout = Layout().with_leaves(mapped_leaves())
-    declaration = declared_type(designator).declaration
     assert layout.with_declaration(declaration) == layout
 
 
@@ -199,48 +195,3 @@ async def test_a_question_for_a_concept_finds_its_subclasses(log: EventLog) -> N
     )
     async with log.engine.connect() as connection:
         assert (await connection.exec_driver_sql(by_hand)).scalars().all() == ["GraspingAction"]
-
-
-# === language classes =========================================================================================
-#
-# The mapped classes of the plan language agree with the expressions, and a fresh memory has a table for each.
-
-EXPRESSIONS = [Sequential, TryInOrder, Parallel, TryAll, Repeat, Monitor, Code, Retry]
-COLUMNS = {
-    "Repeat": {"times"},
-    "Monitor": {"condition", "interval_s"},
-    "Code": {"function"},
-    "Retry": {"max_tries"},
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("expression", EXPRESSIONS, ids=lambda each: each.__name__)
-def test_every_expression_has_a_mapped_class(expression: type) -> None:
-    declaration = declared_type(expression).declaration
-    mapped = getattr(pycrorm_async.orm, expression.__name__)
-    table = inspect(mapped).local_table
-    assert isinstance(table, Table)
-    assert (declaration.kind, declaration.dtype, declaration.bases) == ("language", expression.__name__, ())
-    assert issubclass(mapped, Language)
-    assert mapped.__tablename__ == declaration.table
-    assert {each.name for each in table.columns} == {
-        "id",
-        "process_metadata_id",
-        *COLUMNS.get(expression.__name__, ()),
-    }
-    for field in declaration.fields:
-        assert hasattr(mapped, field.name), field.name
-    layout = Layout().with_leaves(mapped_leaves())
-    assert layout.with_declaration(declaration) == layout
-
-
-@pytest.mark.slow
-async def test_a_fresh_memory_has_an_empty_table_for_each_expression(log: EventLog) -> None:
-    await stored_and_folded(log, [])
-    async with AsyncSession(log.engine) as session:
-        for name in ("Language", *(each.__name__ for each in EXPRESSIONS)):
-            mapped = getattr(pycrorm_async.orm, name)
-            assert (await session.scalars(select(mapped))).all() == []
-            assert await session.scalar(select(func.count()).select_from(mapped)) == 0
-    assert not issubclass(Language, Action | Motion)

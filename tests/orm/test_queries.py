@@ -85,6 +85,8 @@ from tests.projections.event_script import (
 )
 from tests.projections.sql_queries import ask, stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 # === queries ==================================================================================================
 #
 # The queries of the thesis, and the attributes of a row that are loaded without another query.
@@ -95,7 +97,6 @@ CLASSES = sorted(
 )
 
 
-@pytest.mark.slow
 async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     await Projector(log).open()
     always_filled = (Base, Concept, ConceptAncestor, ObjectConcept)  # the concepts belong to the program
@@ -104,7 +105,6 @@ async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
-@pytest.mark.slow
 async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -> None:
     (metadata,) = await every(breakfast, select(ProcessMetaData))
     assert repr(metadata) == (
@@ -116,14 +116,12 @@ async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -
     )
 
 
-@pytest.mark.slow
 async def test_the_version_of_an_episode_has_the_name_from_the_thesis_as_a_synonym(breakfast: EventLog) -> None:
     (metadata,) = await every(breakfast, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
     assert metadata.pycram_version == metadata.version == "1.0"
     assert await every(breakfast, select(ProcessMetaData.pycram_version)) == ["1.0"]
 
 
-@pytest.mark.slow
 async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) -> None:
     (drive,) = await every(breakfast, select(NavigateAction))
     assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
@@ -138,7 +136,6 @@ async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) ->
     assert state.pose.process_metadata is drive.process_metadata
 
 
-@pytest.mark.slow
 async def test_the_text_of_an_action_has_its_fields_and_its_robot(breakfast: EventLog) -> None:
     (pick,) = await every(breakfast, select(PickUpAction))
     assert repr(pick) == (
@@ -149,7 +146,6 @@ async def test_the_text_of_an_action_has_its_fields_and_its_robot(breakfast: Eve
     )
 
 
-@pytest.mark.slow
 async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog) -> None:
     actions = await every(breakfast, select(Action).order_by(Action.id))
     assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
@@ -168,14 +164,12 @@ async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog)
     assert designators[0].target_location.position.x == 7.0
 
 
-@pytest.mark.slow
 async def test_the_pose_of_a_picked_up_object_is_the_one_at_execution(breakfast: EventLog) -> None:
     for picked in (PickUpAction.object, PickUpAction.object_designator):
         poses = await every(breakfast, select(Pose).join(picked).join(Object.pose))
         assert [(each.position.x, each.position.y, each.position.z) for each in poses] == [(1.0, 2.0, 3.0)]
 
 
-@pytest.mark.slow
 async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: EventLog) -> None:
     nodes = {each.id: each for each in await every(breakfast, select(TaskTreeNode))}
     assert sorted(nodes) == [row(2), row(6), row(8), row(11), row(15), row(16)]
@@ -192,14 +186,6 @@ async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: Even
     assert await every(breakfast, lost) == [row(2), row(15), row(16)]
 
 
-@pytest.mark.slow
-async def test_one_node_alone_has_its_parent_loaded(breakfast: EventLog) -> None:
-    (node,) = await every(breakfast, select(TaskTreeNode).where(TaskTreeNode.id == row(8)))
-    assert node.parent.id == row(6)
-    assert node.parent.action.robot_state.pose.position.x == 0.5
-
-
-@pytest.mark.slow
 async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
         move = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.id == row(8)))).one()
@@ -221,7 +207,6 @@ async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
     assert [each.node and each.node.id for each in moved if each.name == "milk"] == [None, row(11)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("class_", "sequence", "name"),
     [(TaskTreeNode, 2, "children"), (TaskTreeNode, 8, "ancestors"), (Object, 12, "node")],
@@ -241,7 +226,6 @@ async def test_an_attribute_that_is_not_loaded_names_the_remedy(
         getattr(closed, name)
 
 
-@pytest.mark.slow
 async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
     question = (
         select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == Arms.LEFT)
@@ -252,7 +236,6 @@ async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
         assert [each.id for each in await session.scalars(other)] == [row(11)]
 
 
-@pytest.mark.slow
 async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
     question = (
         select(Position.x, Quaternion.z)
@@ -266,7 +249,6 @@ async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
         assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
-@pytest.mark.slow
 async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakfast: EventLog) -> None:
     milk = await every(breakfast, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
     assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
@@ -280,7 +262,6 @@ async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakf
     assert robot.joints == {"torso": 0.25}
 
 
-@pytest.mark.slow
 async def test_the_changes_of_objects_can_be_queried(breakfast: EventLog) -> None:
     (held,) = await every(breakfast, select(Attachment))
     assert (held.kind, held.parent.name, held.child.name, held.link) == (
@@ -292,7 +273,6 @@ async def test_the_changes_of_objects_can_be_queried(breakfast: EventLog) -> Non
     assert (gone.object.name, gone.identity_id, gone.node_id) == ("milk", row(4), None)
 
 
-@pytest.mark.slow
 async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> None:
     (resolved,) = await every(breakfast, select(LocationResolution))
     assert (resolved.location, resolved.considered, resolved.offered, resolved.taken) == ("CostmapLocation", 9, 1, 0)
@@ -300,7 +280,6 @@ async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> No
     assert [(each.x, each.reachable_arms, each.taken) for each in resolved.candidates] == [(7.0, [Arms.LEFT], True)]
 
 
-@pytest.mark.slow
 async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
@@ -310,7 +289,6 @@ async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
 
 
-@pytest.mark.slow
 async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an_arm_is_a_named_one(
     log: EventLog,
 ) -> None:
@@ -323,7 +301,6 @@ async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an
     assert (pick.arm, pick.grasp, pick.object.obj_type) == (Arms.named("THIRD"), Grasp.TOP, "OAT_MILK")
 
 
-@pytest.mark.slow
 async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: EventLog) -> None:
     later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
     assert await every(breakfast, later) == [row(15), row(16)]
@@ -332,7 +309,6 @@ async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: Event
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
 
 
-@pytest.mark.slow
 async def test_a_row_has_its_event_and_queries_filter_and_order_by_it(breakfast: EventLog) -> None:
     nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
     assert [each.sequence for each in nodes] == sorted((each.sequence for each in nodes), reverse=True)
@@ -343,20 +319,6 @@ async def test_a_row_has_its_event_and_queries_filter_and_order_by_it(breakfast:
     for class_ in (Object, Pose, Attachment, JointChange, ObjectRemoval, RootFailure, PickUpAction):
         (sequences,) = (await every(breakfast, select(func.sum(class_.sequence)))) or [None]
         assert sequences == sum(each.sequence for each in await every(breakfast, select(class_))) > 0, class_
-
-
-@pytest.mark.slow
-async def test_plain_sql_has_the_events_of_a_row(breakfast: EventLog) -> None:
-    nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.id))
-    expected = [(each.sequence, each.end_sequence) for each in nodes]
-    async with breakfast.engine.connect() as connection:
-        for view in ("task_tree_node", "designator"):
-            rows = await connection.exec_driver_sql(f"SELECT id, sequence, end_sequence FROM {view} ORDER BY id")
-            by_id = {row.id: (row.sequence, row.end_sequence) for row in rows}
-            assert by_id.items() <= {each.id: pair for each, pair in zip(nodes, expected, strict=True)}.items()
-        for view in ("action", "motion", "object", "pose", "robot_state", "attachment", "object_removal"):
-            for row_ in await connection.exec_driver_sql(f"SELECT id, sequence FROM {view}"):
-                assert row_.sequence == row_key(row_.id).sequence
 
 
 # === action attributes ========================================================================================
@@ -375,16 +337,6 @@ class ORMWait(Action):
     status: Mapped[str]  # type: ignore[assignment]
 
 
-@pytest.mark.slow
-async def test_an_action_loads_its_node_on_request(breakfast: EventLog) -> None:
-    async with session_on(breakfast) as session:
-        pick = (await session.scalars(select(PickUpAction))).one()
-        assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
-    (pick,) = await every(breakfast, select(PickUpAction).options(selectinload(PickUpAction.node)))
-    assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
-
-
-@pytest.mark.slow
 async def test_an_action_has_its_times_and_its_outcome(breakfast: EventLog) -> None:
     drive, pick, opening = await every(breakfast, select(Action).order_by(Action.start_time))
     assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
@@ -396,7 +348,6 @@ async def test_an_action_has_its_times_and_its_outcome(breakfast: EventLog) -> N
     assert (move.status, move.duration) == (TaskStatus.SUCCEEDED, 1.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("condition", "expected"),
     [
@@ -415,14 +366,12 @@ async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
     assert await every(breakfast, slowest_last) == [row(each) for each in expected]
 
 
-@pytest.mark.slow
 async def test_an_action_joins_its_episode(breakfast: EventLog) -> None:
     question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
     async with session_on(breakfast) as session:
         assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
 async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(breakfast: EventLog, view: str) -> None:
     columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
@@ -434,7 +383,6 @@ async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(brea
     assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
 
 
-@pytest.mark.slow
 async def test_a_field_with_the_name_of_an_action_attribute_hides_it(log: EventLog) -> None:
     script = Script()
     node = script.put(NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
@@ -555,7 +503,6 @@ def failing() -> Script:
     return script
 
 
-@pytest.mark.slow
 async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
     first, second, opening, plan = await every(log, select(RootFailure).order_by(RootFailure.id))
@@ -574,7 +521,6 @@ async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_messa
     assert await every(log, lost) == ["root > OpenAction"]
 
 
-@pytest.mark.slow
 async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: EventLog) -> None:
     script = Script()
     put = script.put
@@ -590,7 +536,6 @@ async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: Ev
     assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)
 
 
-@pytest.mark.slow
 async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
     note = declared("NoteAction", "note_action", field("lines", "dict", 2, item="text"))
     script = Script()
@@ -602,7 +547,6 @@ async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
     assert (failure.path, failure.object, failure.recovered) == ("NoteAction", None, False)
 
 
-@pytest.mark.slow
 async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
     script = failing()
     for place, each in enumerate(script.records[:-3]):  # the second episode has none
@@ -618,7 +562,6 @@ async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventL
     assert counts == [1, 4]
 
 
-@pytest.mark.slow
 async def test_plain_sql_counts_where_failures_began(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
     question = "SELECT path, object, count(*) FROM root_failure GROUP BY path, object ORDER BY path"

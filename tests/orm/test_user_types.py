@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import gc
 import subprocess
 import sys
@@ -14,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import ForeignKey, func, select
+from sqlalchemy import ForeignKey, select
 from sqlalchemy.orm import Mapped, load_only, mapped_column, registry, undefer
 
-from pycrorm_async import Memory, UserView
+from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import Action, Base, Designator, Motion, PickUpAction, TaskTreeNode
@@ -31,13 +30,13 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Grasp, ObjectType, Pose
 from pycrorm_async.world.pose import Arms
-from tests.commands import environment, run_script
+from tests.commands import environment
 from tests.memory.note_actions import NoteActionPerformable, url_of
 from tests.orm.recorded_breakfast import session_on
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
 
 
 # === dynamic classes ==========================================================================================
@@ -103,7 +102,6 @@ async def classes_of(log: EventLog) -> AsyncIterator[DynamicClasses]:
         classes.dispose()
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_type_without_a_class_is_read_as_its_nearest_class(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
@@ -120,15 +118,6 @@ async def test_a_type_without_a_class_is_read_as_its_nearest_class(log: EventLog
     assert names([each.action for each in nodes]) == ["PickUpAction", "Action", "Motion", "Language"]
 
 
-@pytest.mark.soak_on("postgresql")
-async def test_its_fields_are_among_its_parameters(log: EventLog) -> None:
-    await stored_and_folded(log, [*KINDS, *all_kinds().records])
-    async with session_on(log) as session:
-        saying = (await session.scalars(select(Action).where(Action.dtype == "SayingAction"))).one()
-        assert await saying.awaitable_attrs.parameters == {"text": "hi"}
-
-
-@pytest.mark.soak_on("postgresql")
 async def test_a_class_is_made_for_it_with_its_fields(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     async with classes_of(log) as classes:
@@ -148,7 +137,6 @@ async def test_a_class_is_made_for_it_with_its_fields(log: EventLog) -> None:
         assert nodes[0].action.via.position.x == 7.0
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_their_names(log: EventLog) -> None:
     trip = declared(
         "TripAction",
@@ -173,7 +161,6 @@ async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_the
         assert only_row.loads == {"milk": 2, "cup": 1}
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_field_of_a_made_class_hides_an_attribute_that_every_action_has(log: EventLog) -> None:
     fields = field("duration", "real", 2), field("reason", "text", 3), field("episode", "integer", 4)
     wait = declared("WaitAction", "wait_action", *fields)
@@ -193,7 +180,6 @@ async def test_a_field_of_a_made_class_hides_an_attribute_that_every_action_has(
         assert await every(log, select(mapped_class.duration).where(mapped_class.duration > 50)) == [60.0]
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_class_can_be_requested_by_type_table_or_designator(log: EventLog) -> None:
     class SayingActionPerformable:
         dtype = "SayingAction"
@@ -209,7 +195,6 @@ async def test_a_class_can_be_requested_by_type_table_or_designator(log: EventLo
             classes.of("Waving")
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_type_that_appears_after_the_first_query_is_in_the_answer(log: EventLog) -> None:
     projector = Projector(log)
     await projector.open()
@@ -225,7 +210,6 @@ async def test_a_type_that_appears_after_the_first_query_is_in_the_answer(log: E
         assert names(await every(log, select(PickUpAction))) == ["CarefulPickUpAction"]
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_field_that_appears_later_is_an_attribute_of_the_existing_class(log: EventLog) -> None:
     louder = declared("SayingAction", "saying_action", field("text", "text", 2), field("volume", "real", 3))
     script = all_kinds()
@@ -245,7 +229,6 @@ async def test_a_field_that_appears_later_is_an_attribute_of_the_existing_class(
         assert [each.text for each in await every(log, select(grown).where(grown.volume > 0.1))] == ["HI"]
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_two_memories_with_types_of_one_name_do_not_share_classes(log: EventLog, tmp_path: Path) -> None:
     other_saying = declared("SayingAction", "saying_action", field("words", "integer", 2))
     other = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/other.db"), create=True)
@@ -267,7 +250,6 @@ async def test_two_memories_with_types_of_one_name_do_not_share_classes(log: Eve
         await other.close()
 
 
-@pytest.mark.soak_on("postgresql")
 def test_classes_of_memories_that_were_never_closed_do_not_collide() -> None:
     saying = declared("UnclosedAction", "unclosed_action", field("text", "text", 2))
     left: list[tuple[registry, type[Designator]]] = []
@@ -287,7 +269,6 @@ def test_classes_of_memories_that_were_never_closed_do_not_collide() -> None:
             mapper._expire_memoizations()
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_disposed_classes_leave_no_references(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     identities = dict(Designator.__mapper__.polymorphic_map)
@@ -308,7 +289,6 @@ async def test_disposed_classes_leave_no_references(log: EventLog) -> None:
     assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_an_authors_class_is_the_class_of_its_rows(log: EventLog) -> None:
     remark = declared("RemarkAction", "ORMRemark", field("text", "text", 2))
     script = Script()
@@ -323,13 +303,11 @@ async def test_an_authors_class_is_the_class_of_its_rows(log: EventLog) -> None:
         assert classes.of("RemarkAction") is ORMRemark
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_an_authors_class_has_a_table_before_its_first_row(log: EventLog) -> None:
     await Projector(log).open()
     assert await every(log, select(ORMRemark)) == []
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_rows_from_before_an_authors_class_was_declared_are_of_that_class_too(log: EventLog) -> None:
     before = declared("RemarkAction", "remark_action", field("text", "text", 2))
     after = declared("RemarkAction", "ORMRemark", field("text", "text", 2))
@@ -344,7 +322,6 @@ async def test_rows_from_before_an_authors_class_was_declared_are_of_that_class_
     ]
 
 
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("declaration", [SAYING, CAREFUL], ids=lambda each: each.dtype)
 async def test_a_type_can_be_queried_while_its_base_is_unknown(
     log: EventLog, declaration: DesignatorTypeDeclared
@@ -377,7 +354,6 @@ configure_mappers()
 """
 
 
-@pytest.mark.soak_on("postgresql")
 def test_a_class_that_is_deleted_before_any_query_affects_none() -> None:
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", IN_A_NEW_PROCESS]
@@ -396,20 +372,6 @@ class GentlePickUpActionPerformable(PickUpActionPerformable):
 
     async def perform(self) -> None:
         """Lift nothing: the test is about the recorded row."""
-
-
-async def test_a_user_view_is_made_beside_the_tables(tmp_path: Path) -> None:
-    view = UserView("attempts", select(TaskTreeNode.dtype, func.count().label("times")).group_by(TaskTreeNode.dtype))
-    async with Memory.open(url_of(tmp_path), views=[view]) as memory:
-        async with memory.episode(description="e"):
-            await NoteActionPerformable("a").perform()
-            await NoteActionPerformable("b").perform()
-        await memory.flush()
-        async with memory.session() as session:
-            rows = (await session.execute(select(view.table).order_by(view.table.c.times))).all()
-        assert [tuple(row) for row in rows] == [(None, 1), ("NoteAction", 2)]
-        frame = await memory.dataframe(select(view.table))
-        assert sorted(frame.times) == [1, 2]
 
 
 async def test_a_subclass_of_an_action_is_listed_among_that_action(tmp_path: Path) -> None:
@@ -435,31 +397,6 @@ async def test_a_memory_that_only_records_generates_no_class(tmp_path: Path) -> 
         assert set(identities) == before
         mapped = memory.mapped(NoteActionPerformable)
         assert set(identities) - before == {mapped.__mapper__.polymorphic_identity}
-
-
-async def test_a_process_that_lacks_the_class_still_reads_its_rows(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)):
-        await NoteActionPerformable("seen").perform()
-    script = (
-        "import asyncio, sys\n"
-        "from sqlalchemy import select\n"
-        "from pycrorm_async import Reading\n"
-        "from pycrorm_async.orm import Action, Designator, TaskTreeNode\n"
-        "async def main():\n"
-        "    async with Reading.open(sys.argv[1]) as reading, reading.session() as session:\n"
-        "        for kind in (Action, Designator):\n"
-        "            (note,) = (await session.scalars(select(kind))).all()\n"
-        "            print(type(note).__name__, note.dtype, note.text)\n"
-        "        nodes = (await session.scalars(select(TaskTreeNode).order_by(TaskTreeNode.id))).all()\n"
-        "        print([node.action.text if node.action else None for node in nodes])\n"
-        "asyncio.run(main())\n"
-    )
-    done = await asyncio.to_thread(run_script, script, url_of(tmp_path))
-    assert done.stdout.splitlines() == [
-        "NoteAction NoteAction seen",
-        "NoteAction NoteAction seen",
-        "[None, 'seen']",
-    ], done.stderr
 
 
 async def test_a_plain_engine_sees_an_unknown_type_as_an_action_with_its_parameters(tmp_path: Path) -> None:

@@ -38,7 +38,6 @@ def layout_of(*types: DesignatorTypeDeclared) -> Layout:
     return layout
 
 
-@pytest.mark.slow
 def test_columns_of_one_type_unite_in_the_order_of_declaration() -> None:
     louder = declared("SayingAction", "saying_action", field("volume", "real", 2), field("text", "text", 3))
     layout = layout_of(SAYING, louder)
@@ -46,13 +45,11 @@ def test_columns_of_one_type_unite_in_the_order_of_declaration() -> None:
     assert layout_of(SAYING, louder, SAYING) == layout
 
 
-@pytest.mark.slow
 def test_lists_and_dicts_have_no_column() -> None:
     joints = declared("MoveJointsMotion", "move_joints_motion", field("names", "list", 2, item="text"), kind="motion")
     assert layout_of(joints).leaves == {"move_joints_motion": {}}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("second", "reason"),
     [
@@ -87,13 +84,11 @@ def test_a_declaration_that_contradicts_a_table_is_refused_with_both_named(
     assert str(raised.value) == reason
 
 
-@pytest.mark.slow
 def test_a_contradiction_with_another_table_of_the_same_type_is_refused() -> None:
     with pytest.raises(LayoutConflict):
         layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
-@pytest.mark.slow
 def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the_type() -> None:
     layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
     with pytest.raises(LayoutConflict, match=r"SayingAction\.text is declared as text and as real"):
@@ -101,7 +96,6 @@ def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the
     assert layout.with_declaration(SAYING) == layout
 
 
-@pytest.mark.slow
 def test_a_view_lists_all_tables_of_its_type_and_of_its_descendants() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     gentle = declared("GentlePickUpAction", "gentle", bases=("CarefulPickUpAction", "PickUpAction"))
@@ -112,7 +106,6 @@ def test_a_view_lists_all_tables_of_its_type_and_of_its_descendants() -> None:
     assert layout.members("gentle") == ("gentle",)
 
 
-@pytest.mark.slow
 def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_an_existing_class() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     layout = layout_of(PICK_UP, careful, SAYING, declared("MoveMotion", "move_motion", kind="motion"))
@@ -121,7 +114,6 @@ def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_an_exis
     assert layout.lineage("CarefulPickUpAction") == "CarefulPickUpAction careful PickUpAction Action"
 
 
-@pytest.mark.slow
 def test_mapped_classes_add_missing_columns_and_never_change_declared_ones() -> None:
     layout = layout_of(SAYING).with_leaves(
         [Leaf("saying_action", {"text": "integer", "volume": "real"}, "SayingAction", "action"), Leaf("ORMLog", {})]
@@ -141,7 +133,6 @@ HELLO = replace(declared("HelloAction", "hello_action", field("whom", "text", 2)
 LOUD = declared("LoudGreetAction", "loud_greet_action", bases=("GreetAction",))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("order", list(permutations([GREET, WELCOME, HELLO, LOUD])))
 def test_a_type_and_its_former_name_are_one_type_whichever_was_declared_first(
     order: tuple[DesignatorTypeDeclared, ...],
@@ -163,7 +154,6 @@ def test_a_type_and_its_former_name_are_one_type_whichever_was_declared_first(
     assert layout.lineage("LoudGreetAction").split()[:2] == ["LoudGreetAction", "HelloAction"]
 
 
-@pytest.mark.slow
 def test_a_former_name_that_two_types_claim_belongs_to_the_first() -> None:
     bow = replace(declared("BowAction", "bow_action"), aliases=("GreetAction",))
     layout = layout_of(GREET, WELCOME)
@@ -174,7 +164,6 @@ def test_a_former_name_that_two_types_claim_belongs_to_the_first() -> None:
     assert both.renamed == {"GreetAction": "BowAction", "WelcomeAction": "BowAction"}
 
 
-@pytest.mark.slow
 def test_a_type_that_returns_to_an_earlier_name_stays_one_type() -> None:
     back = replace(GREET, aliases=("WelcomeAction",))
     layout = layout_of(GREET, WELCOME, back)
@@ -182,7 +171,6 @@ def test_a_type_that_returns_to_an_earlier_name_stays_one_type() -> None:
     assert layout_of(GREET, WELCOME, back, GREET, WELCOME, back) == layout
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("former", "reason"),
     [
@@ -204,7 +192,6 @@ def test_an_impossible_former_name_is_refused_and_changes_nothing(former: Design
     assert layout_of(WELCOME).types["WelcomeAction"].tables == ("welcome_action",)
 
 
-@pytest.mark.slow
 def test_tables_that_become_one_type_must_all_agree() -> None:
     own = replace(declared("WelcomeAction", "ORMWelcome"), aliases=("GreetAction",))
     layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
@@ -212,7 +199,6 @@ def test_tables_that_become_one_type_must_all_agree() -> None:
         layout.with_declaration(own)
 
 
-@pytest.mark.slow
 def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:
     shouting = declared("ShoutingAction", "shouting_action", field("volume", "real", 2), bases=("SayingAction",))
     telling = declared("TellingAction", "telling_action", field("text", "text", 2))

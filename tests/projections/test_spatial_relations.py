@@ -36,6 +36,8 @@ from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations,
 from tests.projections.sql_queries import ask, stored_and_folded
 from tests.projections.verify_cases import rebuilt
 
+pytestmark = pytest.mark.slow
+
 PLACE = declared(
     "PlaceAction",
     "place_action",
@@ -112,7 +114,6 @@ async def relations(
     return found
 
 
-@pytest.mark.slow
 async def test_a_picked_up_object_is_related_as_it_was_before(log: EventLog) -> None:
     tidying = Tidying()
     tidying.add("milk", "MILK", 1.3, 1.0, 0.9)
@@ -132,7 +133,6 @@ async def test_a_picked_up_object_is_related_as_it_was_before(log: EventLog) -> 
     }
 
 
-@pytest.mark.slow
 async def test_a_placed_object_is_related_as_it_is_at_the_end(log: EventLog) -> None:
     tidying = Tidying()
     tidying.add("milk", "MILK", 1.3, 1.0, 0.9)
@@ -147,7 +147,6 @@ async def test_a_placed_object_is_related_as_it_is_at_the_end(log: EventLog) -> 
     }
 
 
-@pytest.mark.slow
 async def test_an_object_is_in_a_drawer_where_its_joint_has_it(log: EventLog) -> None:
     tidying = Tidying()
     tidying.add("cup", "JEROEN_CUP", 0.85, 0.35, 0.67)
@@ -162,7 +161,6 @@ async def test_an_object_is_in_a_drawer_where_its_joint_has_it(log: EventLog) ->
     assert not {outside, closed} & found.keys()
 
 
-@pytest.mark.slow
 async def test_a_relation_leads_to_its_node_and_names_both_rows(log: EventLog) -> None:
     tidying = Tidying()
     tidying.add("bowl", "BOWL", 1.3, 0.2, 0.88)
@@ -189,7 +187,6 @@ def box_urdf(name: str, size: str, at: str = "0 0 0", rpy: str = "0 0 0") -> str
     return f'<robot name="{name}">\n<link name="{name}"><collision>{shape}</collision></link></robot>'
 
 
-@pytest.mark.slow
 async def test_an_object_has_the_size_of_its_description_and_not_of_its_type(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()
     crate = declared_.description(box_urdf("crate", "0.6 0.4 0.3"))
@@ -203,7 +200,6 @@ async def test_an_object_has_the_size_of_its_description_and_not_of_its_type(log
     assert await relations(log, tidying, declared_) == {picked: {("on", "crate", "crate"), ("next to", "bar", "bar")}}
 
 
-@pytest.mark.slow
 async def test_relations_end_at_their_distances_and_an_environment_is_no_neighbour(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()
     crate = declared_.description(box_urdf("crate", "0.4 0.4 0.3"))
@@ -227,7 +223,6 @@ async def test_relations_end_at_their_distances_and_an_environment_is_no_neighbo
     }
 
 
-@pytest.mark.slow
 async def test_an_object_is_in_a_sliding_part_of_a_recorded_description(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()
     box = '<collision><geometry><box size="{}"/></geometry></collision>'
@@ -250,7 +245,6 @@ async def test_an_object_is_in_a_sliding_part_of_a_recorded_description(log: Eve
     assert await relations(log, tidying, declared_) == {inside: {("in", "chest", "tray")}}
 
 
-@pytest.mark.slow
 async def test_the_links_of_a_recorded_kitchen_are_those_of_the_built_in_one(log: EventLog) -> None:
     declared_ = Declared()
     kitchen = declared_.description(built_in_model("kitchen"))
@@ -284,7 +278,6 @@ async def boxes_by_model(log: EventLog, generation: int = 1001) -> dict[str, int
 
 
 @pytest.mark.soak_on("sqlite")
-@pytest.mark.slow
 async def test_the_boxes_of_a_description_are_stored_once_rebuilt_and_verified(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()
     kitchen = declared_.description(built_in_model("kitchen"))

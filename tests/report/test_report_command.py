@@ -25,7 +25,7 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.report import document
 from pycrorm_async.report.output_files import new_file, new_folder, write_file
-from pycrorm_async.report.write import overview, write_page
+from pycrorm_async.report.write import overview
 from tests.commands import one_line_of, pycrorm
 from tests.full_disk import files_of_at_most
 
@@ -144,14 +144,6 @@ def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(
         (True, True),
         (False, False),
     ]
-
-
-@pytest.mark.slow
-def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:
-    with files_of_at_most(10_000), pytest.raises(OSError, match="File too large") as raised:
-        write_page("x" * 100_000, tmp_path / "page.html")
-    assert raised.value.filename == str(tmp_path / "page.html")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
@@ -340,12 +332,6 @@ def test_a_table_has_the_chosen_episodes_and_their_pages(
     assert (document["title"], document["total"]) == (title, len(numbers))
     assert [each["number"] for each in document["episodes"]] == numbers
     assert sorted(each.stem for each in (tmp_path / "all.pages").iterdir()) == [f"episode-{each}" for each in numbers]
-
-
-def test_a_choice_of_no_episode_is_refused_as_by_the_list_of_episodes(url: str, tmp_path: Path) -> None:
-    code, text = report(url, tmp_path / "all.html", "--robot", "pr3")
-    assert (code, text) == (2, "pycrorm: no episode matches these options; the memory has no robot pr3\n")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_successes_over_any_columns_of_the_chosen_episodes_are_in_the_page(url: str, tmp_path: Path) -> None:
