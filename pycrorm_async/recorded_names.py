@@ -27,7 +27,6 @@ _MOVED: Final = {
     ("recall.following", "recall.answer"): "Relation",
     ("recording.values.value_snapshot", "record.values"): "UnrecordableValue",
     ("recording.writing.emitter", "record.episode_writer"): "BlobRefused",
-    ("store.append_rules", "store.append"): "NumbersExhausted",
     ("store.postgresql.errors", "store.postgresql_errors"): "CommitInDoubt",
     ("world.enums", "world.pose"): "Arms Grasp GripperState JointType ObjectType WorldMode",
     ("world.errors", "world.pose"): """

@@ -86,16 +86,6 @@ class EpisodeStep:
     skipped_ends: int = 0
 
 
-class NumbersExhausted(ValueError):
-    """All episode numbers are used."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
-            " move its spool to a new memory with `pycrorm spool rebind`"
-        )
-
-
 def sort(records: Iterable[Record]) -> SortedBatch:
     """Split a batch by episode. Raises `DamageError` for a record without an episode that is not a declaration."""
     declarations: dict[str, bytes] = {}
@@ -118,13 +108,6 @@ def step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
     if first == row.head + 1 and _consecutive(records) and _sound(records):
         return EpisodeStep(_advanced(row, records, refused=None), list(records))
     return _careful_step(records, row)
-
-
-def new_episode(episode: EpisodeId, first: Record, number: int) -> EpisodeRow:
-    """Create the row of an episode without stored events. Raises `NumbersExhausted`."""
-    if number > EPISODE_NUMBER_MAX:
-        raise NumbersExhausted
-    return EpisodeRow(number, episode_text(episode), head=0, folded=0, started_wall_ns=first.wall_ns)
 
 
 def differing(again: Iterable[Record], stored: Mapping[int, StoredEvent]) -> int | None:
@@ -414,12 +397,16 @@ class Appending:
         rows = await self._read_rows(connection)
         refusals: dict[EpisodeId, str] = {}
         missing = [each for each in self._batch.episodes if each not in rows]
-        if missing:
-            for each, number in (await self._assign_numbers(connection, missing)).items():
-                try:
-                    rows[each] = new_episode(each, self._batch.episodes[each][0], number)
-                except NumbersExhausted as refusal:
-                    refusals[each] = str(refusal)
+        numbers = await self._assign_numbers(connection, missing) if missing else {}
+        for each, number in numbers.items():
+            if number > EPISODE_NUMBER_MAX:
+                refusals[each] = (
+                    f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
+                    " move its spool to a new memory with `pycrorm spool rebind`"
+                )
+            else:
+                started_ns = self._batch.episodes[each][0].wall_ns
+                rows[each] = EpisodeRow(number, episode_text(each), head=0, folded=0, started_wall_ns=started_ns)
         return rows, refusals
 
     async def _assign_numbers(self, connection: AsyncConnection, missing: Sequence[EpisodeId]) -> dict[EpisodeId, int]:
