@@ -27,6 +27,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import chain
 from typing import Any, Literal, Protocol, TypeAlias
 
 import msgspec
@@ -34,7 +35,6 @@ from sqlalchemy import Dialect, Index, Integer, LargeBinary, Select, Text, colum
 from sqlalchemy.exc import ArgumentError, CompileError, IdentifierError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement
-from sqlalchemy.schema import Index as SchemaIndex
 
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, TablesOutdated
 from pycrorm_async.events.codec import declared_dtype, fingerprint
@@ -118,10 +118,6 @@ class Generation:
     layout: Layout
     views: dict[str, str]
     version: int = PROJECTION_VERSION
-
-    def without_unmade(self) -> Generation:
-        """Return the generation without its record of refused tables, so that they can be tried again."""
-        return replace(self, layout=msgspec.structs.replace(self.layout, unmade={}))
 
 
 async def current_generation(connection: AsyncConnection, *, hold: Hold | None = None) -> Generation | None:
@@ -257,16 +253,15 @@ async def _replace_views(
             raise
     else:
         return refused
-    for name in ("", *(each for each in views if each in users)):  # first without any
-        added = {name: views[name]} if name else {}
+    for name in [each for each in views if each in users]:
         try:
             async with connection.begin_nested() as attempt:
-                await dialect.replace_views(connection, before, created | added)
+                await dialect.replace_views(connection, before, created | {name: views[name]})
                 await attempt.rollback()
-            created |= added
+            created[name] = views[name]
         except dialect.faults as error:
             reason = dialect.refusal(error)
-            if reason is None or not name:
+            if reason is None:
                 raise
             _log.warning("the view %s is left out, because the database refuses it: %s", name, reason)
             refused[name] = reason
@@ -338,8 +333,9 @@ def _text_of(view: ViewDefinition, tables: Tables, syntax: _Syntax) -> str:
 async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[str, Storage]], generation: int) -> None:
     """Create these tables of a generation, given by name and columns, with their indexes."""
     dialect = dialect_of(connection)
-    if statements := table_texts(tables, generation, dialect.stored_column, connection.dialect):
-        await dialect.execute_all(connection, statements)
+    if tables:
+        texts = table_texts(tables, generation, dialect.stored_column, connection.dialect)
+        await dialect.execute_all(connection, texts)
         await dialect.expect(connection, [expected(name, dict(each), generation) for name, each in tables.items()])
 
 
@@ -348,11 +344,8 @@ def table_texts(
 ) -> list[str]:
     """Return the statements that create these tables and their indexes."""
     syntax = _syntax_of(dialect)
-    return [
-        statement
-        for name, columns in tables.items()
-        for statement in _definitions(name, tuple(columns.items()), generation, stored, syntax)
-    ]
+    of_each = (_definitions(name, tuple(each.items()), generation, stored, syntax) for name, each in tables.items())
+    return [*chain.from_iterable(of_each)]
 
 
 @lru_cache(maxsize=_TEXTS_KEPT)
@@ -385,11 +378,7 @@ async def _add_columns(
         await dialect_of(connection).add_column(connection, physical_name(name, generation), str(definition))
         if new in indexed(name, columns):
             named = index_name(name, new, generation)
-            await connection.execute(CreateIndex(_index_named(table.indexes, named)))
-
-
-def _index_named(indexes: set[SchemaIndex], name: str) -> SchemaIndex:
-    return next(each for each in indexes if each.name == name)
+            await connection.execute(CreateIndex(next(each for each in table.indexes if each.name == named)))
 
 
 # === materialised views =======================================================================================
