@@ -190,18 +190,6 @@ async def test_a_batch_cut_at_any_byte_is_stored_whole_or_not_at_all(proxy: Prox
     await log.close()
 
 
-async def test_a_connection_that_dribbles_stores_everything(proxy: Proxy, direct_url: str) -> None:
-    proxy.dribble(64)
-    records = records_of_three_episodes(random.Random(10), 1000)
-
-    async def no_fault(_: Drain) -> None:
-        return
-
-    drain, source = await drained(url_through_proxy(proxy, direct_url), records, no_fault)
-    assert drain.state.retries == 0
-    verify_stored_once(direct_url, records, drain, source)
-
-
 async def test_a_server_that_refuses_every_connection_is_unavailable_until_it_accepts_one(
     proxy: Proxy, direct_url: str
 ) -> None:

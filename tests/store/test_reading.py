@@ -224,31 +224,28 @@ def lost(sequence: int) -> Record:
     return record(episode(1), sequence + 1, kind="EpisodeEnded", payload=b'{"status":"LOST"}', wall_ns=50 + sequence)
 
 
-async def test_a_computed_end_follows_the_events_of_the_log_when_the_folder_had_fewer(
-    log: EventLog, database_url: str
+END = record(episode(1), 6, kind="EpisodeEnded", payload=b'{"status":"SUCCEEDED"}')
+
+
+@pytest.mark.parametrize(
+    ("stored", "known", "head"),
+    [
+        pytest.param(run_of(episode(1), 1, 5), 2, 6, id="it follows the events that only the log has"),
+        pytest.param([*run_of(episode(1), 1, 5), END], 3, 6, id="it is left out behind an end"),
+        pytest.param([], 3, 4, id="it is stored once"),
+    ],
+)
+async def test_a_computed_end_ends_what_the_log_has(
+    log: EventLog, database_url: str, stored: list[Record], known: int, head: int
 ) -> None:
-    await log.append(run_of(episode(1), 1, 5))
+    await log.append(stored)
+    end = END if END in stored else lost(known)
     for _ in range(2):  # a repaired folder that is drained twice
-        assert await log.append([*run_of(episode(1), 1, 2), lost(2)]) == {}
-        assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4, 5, 6]
-        assert ask(database_url, EVENTS)[-1] == (6, "EpisodeEnded", '{"status":"LOST"}')
-        assert ask(database_url, HEADS) == [(6, 52, None)]
-
-
-async def test_a_computed_end_is_ignored_when_the_log_has_an_end(log: EventLog, database_url: str) -> None:
-    whole = [*run_of(episode(1), 1, 5), record(episode(1), 6, kind="EpisodeEnded", payload=b'{"status":"SUCCEEDED"}')]
-    await log.append(whole)
-    assert await log.append([*run_of(episode(1), 1, 3), lost(3)]) == {}
-    assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4, 5, 6]
-    assert ask(database_url, HEADS)[0][0] == 6
-
-
-async def test_a_computed_end_is_stored_once_when_the_folder_and_the_log_agree(
-    log: EventLog, database_url: str
-) -> None:
-    for _ in range(2):
-        assert await log.append([*run_of(episode(1), 1, 3), lost(3)]) == {}
-    assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4]
+        assert await log.append([*run_of(episode(1), 1, known), lost(known)]) == {}
+        events = ask(database_url, EVENTS)
+        assert [row[0] for row in events] == list(range(1, head + 1))
+        assert events[-1][1:] == ("EpisodeEnded", end.payload.decode())
+        assert ask(database_url, HEADS) == [(head, end.wall_ns, None)]
 
 
 async def test_any_other_event_under_a_used_number_is_still_damage(log: EventLog) -> None:

@@ -12,6 +12,7 @@ from sqlalchemy import Select
 from pycrorm_async import Memory
 from pycrorm_async.plan import MoveTorsoAction, NavigateAction, ObjectDesignatorDescription, PickUpAction, PlaceAction
 from pycrorm_async.world import Arms, Grasp, Pose
+from tests.databases import run_in_own_loop
 from tests.plan.conftest import Scene, kitchen
 from tests.promises.lab import results_of, url_of
 
@@ -47,10 +48,15 @@ class Recorded:
         return row
 
 
-@pytest.fixture
-async def planned(tmp_path: Path) -> Recorded:
-    """Perform the common plan in an episode of a new memory."""
-    async with Memory.open(url_of(tmp_path)) as memory, memory.episode(description=DESCRIPTION):
+@pytest.fixture(scope="session")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """The common plan, performed once in an episode of a memory that the tests only read."""
+    folder = tmp_path_factory.mktemp("planned")
+    run_in_own_loop(_record(folder))
+    return Recorded(folder)
+
+
+async def _record(folder: Path) -> None:
+    async with Memory.open(url_of(folder)) as memory, memory.episode(description=DESCRIPTION):
         with kitchen():
             await common_plan()
-    return Recorded(tmp_path)

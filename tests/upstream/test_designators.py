@@ -10,35 +10,9 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory
+from pycrorm_async import Memory, plan
 from pycrorm_async.learning import Evidence, MoveAndPickUp, PickUpChoice, Rectangle, Region, default_policy
 from pycrorm_async.orm import TaskTreeNode
-from pycrorm_async.plan import (
-    CloseAction,
-    DetectAction,
-    FaceAtPerformable,
-    GraspingAction,
-    GripAction,
-    IKError,
-    LookAtAction,
-    MoveTorsoAction,
-    MoveTorsoActionPerformable,
-    NavigateAction,
-    NavigateActionPerformable,
-    ObjectDesignatorDescription,
-    ObjectPart,
-    OpenAction,
-    ParkArmsAction,
-    PickUpAction,
-    PlaceAction,
-    PlanFailure,
-    ReleaseAction,
-    Retry,
-    SetGripperAction,
-    TaskStatus,
-    TransportAction,
-    collected_tree,
-)
 from pycrorm_async.plan.failures import GripperClosedCompletely
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
@@ -58,18 +32,18 @@ pytestmark = pytest.mark.slow
 # Where theirs end with resolving (gripping, releasing: not implemented there) these perform the action as well.
 
 LEFT_TOOL = "l_gripper_tool_frame"
-MILK = ObjectDesignatorDescription(["milk"])
+MILK = plan.ObjectDesignatorDescription(["milk"])
 
 
 async def test_move_torso(scene: Scene) -> None:
-    action = MoveTorsoAction([0.3]).resolve()
+    action = plan.MoveTorsoAction([0.3]).resolve()
     assert (action.position, action.concept) == (0.3, "MoveTorso")
     await action.perform()
     assert scene.robot.joint_position("torso_lift_joint") == 0.3
 
 
 async def test_set_gripper(scene: Scene) -> None:
-    description = SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])
+    description = plan.SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])
     action = description.resolve()
     assert (action.gripper, action.motion, action.concept) == (Arms.LEFT, GripperState.OPEN, "SettingGripper")
     assert len(list(description)) == 2
@@ -79,7 +53,7 @@ async def test_set_gripper(scene: Scene) -> None:
 
 
 async def test_release(scene: Scene) -> None:
-    action = ReleaseAction([Arms.LEFT], MILK).resolve()
+    action = plan.ReleaseAction([Arms.LEFT], MILK).resolve()
     assert (action.gripper, action.object_designator.name, action.concept) == (Arms.LEFT, "milk", "Releasing")
     scene.robot.attach(scene.milk, LEFT_TOOL)
     await action.perform()
@@ -87,7 +61,7 @@ async def test_release(scene: Scene) -> None:
 
 
 async def test_grip(scene: Scene) -> None:
-    action = GripAction([Arms.LEFT], MILK, [0.5]).resolve()
+    action = plan.GripAction([Arms.LEFT], MILK, [0.5]).resolve()
     assert (action.gripper, action.object_designator.name, action.effort) == (Arms.LEFT, "milk", 0.5)
     assert action.concept == "Holding"
     scene.milk.set_pose(scene.robot.link_pose(LEFT_TOOL))
@@ -96,7 +70,7 @@ async def test_grip(scene: Scene) -> None:
 
 
 async def test_park_arms(scene: Scene) -> None:
-    action = ParkArmsAction([Arms.BOTH]).resolve()
+    action = plan.ParkArmsAction([Arms.BOTH]).resolve()
     assert (action.arm, action.concept) == (Arms.BOTH, "ParkingArms")
     await action.perform()
     for arm in (Arms.LEFT, Arms.RIGHT):
@@ -105,34 +79,34 @@ async def test_park_arms(scene: Scene) -> None:
 
 
 async def test_navigate(scene: Scene) -> None:
-    action = NavigateAction([Pose([0.3, 0, 0])]).resolve()
+    action = plan.NavigateAction([Pose([0.3, 0, 0])]).resolve()
     assert (action.target_location, action.concept) == (Pose([0.3, 0, 0]), "Navigating")
     await action.perform()
     assert scene.robot.pose == Pose([0.3, 0, 0])
 
 
 async def test_pick_up(scene: Scene) -> None:
-    action = PickUpAction(MILK, [Arms.LEFT], [Grasp.FRONT]).resolve()
+    action = plan.PickUpAction(MILK, [Arms.LEFT], [Grasp.FRONT]).resolve()
     assert (action.object_designator.name, action.concept) == ("milk", "PickingUp")
-    await NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
-    await MoveTorsoActionPerformable(0.3).perform()
+    await plan.NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
+    await plan.MoveTorsoActionPerformable(0.3).perform()
     await action.perform()
     assert scene.milk in scene.robot.attachments
 
 
 async def test_place(scene: Scene) -> None:
-    action = PlaceAction(MILK, [Pose([1.3, 1, 0.9])], [Arms.LEFT]).resolve()
+    action = plan.PlaceAction(MILK, [Pose([1.3, 1, 0.9])], [Arms.LEFT]).resolve()
     assert (action.object_designator.name, action.concept) == ("milk", "Placing")
-    await NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
-    await MoveTorsoActionPerformable(0.3).perform()
-    await PickUpAction(MILK, [Arms.LEFT], [Grasp.FRONT]).resolve().perform()
+    await plan.NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
+    await plan.MoveTorsoActionPerformable(0.3).perform()
+    await plan.PickUpAction(MILK, [Arms.LEFT], [Grasp.FRONT]).resolve().perform()
     await action.perform()
     assert scene.milk not in scene.robot.attachments
     assert scene.milk.pose.distance(Pose([1.3, 1, 0.9])) < 1e-6
 
 
 async def test_look_at(scene: Scene) -> None:
-    action = LookAtAction([Pose([1, 0, 1])]).resolve()
+    action = plan.LookAtAction([Pose([1, 0, 1])]).resolve()
     assert (action.target, action.concept) == (Pose([1, 0, 1]), "LookingAt")
     await action.perform()
     # The tilt axis is where the head's description has it; the point is straight ahead of it, and lower.
@@ -146,18 +120,18 @@ async def test_detect(scene: Scene) -> None:
     scene.kitchen.remove()
     scene.cereal.remove()
     scene.milk.set_pose(Pose([1.5, 0, 1.2]))
-    action = DetectAction(MILK).resolve()
+    action = plan.DetectAction(MILK).resolve()
     assert (action.object_designator.name, action.concept) == ("milk", "LookingFor")
     result = await action.perform()
     assert (result.name, result.object_type, result.pose) == ("milk", ObjectType.MILK, Pose([1.5, 0, 1.2]))
 
 
 async def test_open(scene: Scene) -> None:
-    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
-    action = OpenAction(handle, [Arms.LEFT]).resolve()
+    handle = plan.ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    action = plan.OpenAction(handle, [Arms.LEFT]).resolve()
     assert (action.object_designator.name, action.arm, action.concept) == (handle.name, Arms.LEFT, "Opening")
-    await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
-    await MoveTorsoActionPerformable(0.1).perform()
+    await plan.NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+    await plan.MoveTorsoActionPerformable(0.1).perform()
     await action.perform()
     # the drawer's limit is 0.35 m, and 0.05 m remain
     assert scene.kitchen.joint_limits("sink_area_drawer_joint") == (0.0, 0.35)
@@ -165,37 +139,37 @@ async def test_open(scene: Scene) -> None:
 
 
 async def test_close(scene: Scene) -> None:
-    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
-    action = CloseAction(handle, [Arms.LEFT]).resolve()
+    handle = plan.ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    action = plan.CloseAction(handle, [Arms.LEFT]).resolve()
     assert (action.object_designator.name, action.arm, action.concept) == (handle.name, Arms.LEFT, "Closing")
     scene.kitchen.set_joint_position("sink_area_drawer_joint", 0.3)
-    await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
-    await MoveTorsoActionPerformable(0.1).perform()
+    await plan.NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+    await plan.MoveTorsoActionPerformable(0.1).perform()
     await action.perform()
     assert scene.kitchen.joint_position("sink_area_drawer_joint") == 0.0
 
 
 async def test_transport(scene: Scene) -> None:
     goal = Pose([-1.35, 0.78, 0.95], yaw_quaternion(math.pi))
-    action = TransportAction(MILK, [Arms.LEFT], [goal]).resolve()
+    action = plan.TransportAction(MILK, [Arms.LEFT], [goal]).resolve()
     assert (action.object_designator.name, action.target_location, action.concept) == ("milk", goal, "Transporting")
-    await MoveTorsoActionPerformable(0.2).perform()
+    await plan.MoveTorsoActionPerformable(0.2).perform()
     await action.perform()
     assert scene.milk.pose.distance(goal) < 0.01
     assert scene.robot.attachments == {}
 
 
 async def test_grasping(scene: Scene) -> None:
-    action = GraspingAction([Arms.RIGHT], MILK).resolve()
+    action = plan.GraspingAction([Arms.RIGHT], MILK).resolve()
     assert (action.object_desig.name, action.arm, action.concept) == ("milk", Arms.RIGHT, "Grasping")
-    await NavigateActionPerformable(Pose([0.6, 1.1, 0])).perform()
+    await plan.NavigateActionPerformable(Pose([0.6, 1.1, 0])).perform()
     await action.perform()
     assert scene.robot.link_pose("r_gripper_tool_frame").distance(scene.milk.pose) < 0.01
     assert scene.robot.attachments == {}
 
 
 async def test_facing(scene: Scene) -> None:
-    await FaceAtPerformable(scene.milk.pose).perform()
+    await plan.FaceAtPerformable(scene.milk.pose).perform()
     seen = scene.milk.pose.relative_to(scene.robot.pose).position
     assert seen.y == pytest.approx(0, abs=1e-9)
     assert seen.x == pytest.approx(math.hypot(1.3, 1))
@@ -209,10 +183,10 @@ async def test_facing(scene: Scene) -> None:
 async def test_retry_with_success(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen() as scene:
-            await Retry(ParkArmsAction([Arms.LEFT]), max_tries=5).perform()
+            await plan.Retry(plan.ParkArmsAction([Arms.LEFT]), max_tries=5).perform()
             # The right arm does not reach from there, the left one does: the second alternative.
             scene.robot.set_pose(Pose([0.6, 0.4, 0]))
-            await Retry(PickUpAction(scene.milk, [Arms.RIGHT, Arms.LEFT], [Grasp.FRONT])).perform()
+            await plan.Retry(plan.PickUpAction(scene.milk, [Arms.RIGHT, Arms.LEFT], [Grasp.FRONT])).perform()
             assert scene.robot.attachments == {scene.milk: "l_gripper_tool_frame"}
     nodes = await Recorded(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
     assert statuses(nodes) == [
@@ -233,10 +207,11 @@ async def test_retry_with_success(tmp_path: Path) -> None:
 
 
 async def test_retry_with_failure(scene: Scene) -> None:
-    with collected_tree() as tree, pytest.raises(PlanFailure) as caught:
+    with plan.collected_tree() as tree, pytest.raises(plan.PlanFailure) as caught:
         # From the origin no alternative can be reached.
-        await Retry(PickUpAction(scene.milk, [Arms.LEFT, Arms.RIGHT], [Grasp.FRONT, Grasp.TOP]), max_tries=3).perform()
-    assert isinstance(caught.value, IKError)
+        pick_up = plan.PickUpAction(scene.milk, [Arms.LEFT, Arms.RIGHT], [Grasp.FRONT, Grasp.TOP])
+        await plan.Retry(pick_up, max_tries=3).perform()
+    assert isinstance(caught.value, plan.IKError)
     assert not isinstance(caught.value, GripperClosedCompletely)
     tried = [node for node in tree if type(node.designator).__name__ == "PickUpActionPerformable"]
     assert [(node.designator.arm, node.designator.grasp) for node in tried] == [  # type: ignore[union-attr]  # they are
@@ -244,7 +219,7 @@ async def test_retry_with_failure(scene: Scene) -> None:
         (Arms.LEFT, Grasp.TOP),
         (Arms.RIGHT, Grasp.FRONT),
     ]
-    assert {node.status for node in tree} == {TaskStatus.FAILED}
+    assert {node.status for node in tree} == {plan.TaskStatus.FAILED}
 
 
 # === move and pick up =========================================================================================
@@ -279,13 +254,13 @@ async def test_move_and_pick_up(scene: Scene, seed: int) -> None:
     for each in tries:
         try:
             await each.perform()
-        except PlanFailure:
+        except plan.PlanFailure:
             scene.world.reset()
         else:
             break
     assert scene.milk.attached_to is scene.robot
     scene.world.reset()
-    await Retry(MoveAndPickUp(scene.milk, rng=np.random.default_rng(seed)), max_tries=20).perform()
+    await plan.Retry(MoveAndPickUp(scene.milk, rng=np.random.default_rng(seed)), max_tries=20).perform()
     assert scene.milk.attached_to is scene.robot
 
 
@@ -295,13 +270,13 @@ async def test_move_and_pick_up(scene: Scene, seed: int) -> None:
 
 
 def test_object_grounding(scene: Scene) -> None:
-    designator = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
+    designator = plan.ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
     assert (designator.name, designator.object_type) == ("milk", ObjectType.MILK)
     assert designator.world_object is scene.milk
 
 
 def test_frozen_copy(scene: Scene) -> None:
-    designator = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
+    designator = plan.ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
     frozen = designator.frozen_copy()
     assert frozen.pose == designator.pose == Pose([1.3, 1, 0.9])
     scene.milk.set_pose(Pose([2, 2, 2]))

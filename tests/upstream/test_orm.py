@@ -13,45 +13,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import func, select
 
-from pycrorm_async import Memory
+from pycrorm_async import Memory, orm, plan
 from pycrorm_async.operations.copy import copy_episodes
-from pycrorm_async.orm import (
-    Action,
-    CloseAction,
-    DetectAction,
-    LookAtAction,
-    Motion,
-    MoveTorsoAction,
-    NavigateAction,
-    Object,
-    ObjectPart,
-    OpenAction,
-    ParkArmsAction,
-    PickUpAction,
-    PickUpWithContextView,
-    PlaceAction,
-    Position,
-    ProcessMetaData,
-    Quaternion,
-    RobotState,
-    SetGripperAction,
-    TaskTreeNode,
-    TransportAction,
-)
-from pycrorm_async.orm import Pose as PoseRow
-from pycrorm_async.plan import CloseAction as Close
-from pycrorm_async.plan import (
-    DetectActionPerformable,
-    LookAtActionPerformable,
-    MoveTorsoActionPerformable,
-    NavigateActionPerformable,
-    OpenActionPerformable,
-    ParkArmsActionPerformable,
-    SetGripperActionPerformable,
-    TransportActionPerformable,
-    collected_tree,
-)
-from pycrorm_async.plan import ObjectPart as Part
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
@@ -79,56 +42,42 @@ async def test_schema_creation(tmp_path: Path) -> None:
         pass
     with closing(sqlite3.connect(tmp_path / "memory.db")) as file, file:
         present = {name for (name,) in file.execute("SELECT name FROM sqlite_schema WHERE type IN ('table', 'view')")}
-    file.close()
-    assert {
-        "position",
-        "quaternion",
-        "task_tree_node",
-        "action",
-        "park_arms_action",
-        "navigate_action",
-        "move_torso_action",
-        "set_gripper_action",
-        "release_action",
-        "grip_action",
-        "pick_up_action",
-        "place_action",
-        "transport_action",
-        "look_at_action",
-        "detect_action",
-        "open_action",
-        "close_action",
-    } <= present
+    tables = """
+        position quaternion task_tree_node action park_arms_action navigate_action move_torso_action set_gripper_action
+        release_action grip_action pick_up_action place_action transport_action look_at_action detect_action open_action
+        close_action
+    """
+    assert set(tables.split()) <= present
 
 
 async def test_node(planned: Recorded) -> None:
     # the root, 4 actions; 1 motion of the drive, 1 of the torso, 5 of the pick-up, 3 of the placing
-    assert len(await planned.all(select(TaskTreeNode))) == 1 + 4 + 10
+    assert len(await planned.all(select(orm.TaskTreeNode))) == 1 + 4 + 10
     # 4 objects when they were added; the robot's at each of 14 designators; targets: of 2 actions, of 1 drive, of
     # 3 + 2 motions of the hand; moved: the robot once, the milk when it was lifted and when it was brought down
     poses = 4 + 14 + 2 + 1 + 5 + 1 + 2
-    assert len(await planned.all(select(PoseRow))) == poses
-    assert len(await planned.all(select(Position))) == poses
-    assert len(await planned.all(select(Quaternion))) == poses
-    assert await planned.all(select(ParkArmsAction)) == []
-    assert len(await planned.all(select(NavigateAction))) == 1
-    assert len(await planned.all(select(Action))) == 4
-    assert {type(each) for each in await planned.all(select(Action))} == {
-        NavigateAction,
-        MoveTorsoAction,
-        PickUpAction,
-        PlaceAction,
+    assert len(await planned.all(select(orm.Pose))) == poses
+    assert len(await planned.all(select(orm.Position))) == poses
+    assert len(await planned.all(select(orm.Quaternion))) == poses
+    assert await planned.all(select(orm.ParkArmsAction)) == []
+    assert len(await planned.all(select(orm.NavigateAction))) == 1
+    assert len(await planned.all(select(orm.Action))) == 4
+    assert {type(each) for each in await planned.all(select(orm.Action))} == {
+        orm.NavigateAction,
+        orm.MoveTorsoAction,
+        orm.PickUpAction,
+        orm.PlaceAction,
     }
 
 
 async def test_metadata_existence(planned: Recorded) -> None:
-    poses = await planned.all(select(PoseRow))
+    poses = await planned.all(select(orm.Pose))
     assert poses
     assert {each.process_metadata.description for each in poses} == {DESCRIPTION}
 
 
 async def test_task_tree_node_parents(planned: Recorded) -> None:
-    nodes = {each.id: each for each in await planned.all(select(TaskTreeNode))}
+    nodes = {each.id: each for each in await planned.all(select(orm.TaskTreeNode))}
     roots = [each for each in nodes.values() if each.parent is None]
     assert [each.parent_id for each in roots] == [None]
     for each in nodes.values():
@@ -146,13 +95,13 @@ async def test_task_tree_node_parents(planned: Recorded) -> None:
 
 
 async def test_meta_data(planned: Recorded) -> None:
-    metadata = await planned.one(select(ProcessMetaData))
+    metadata = await planned.one(select(orm.ProcessMetaData))
     assert metadata.status == "SUCCEEDED"
-    for mapped in (Action, Motion, Object, RobotState, TaskTreeNode):
+    for mapped in (orm.Action, orm.Motion, orm.Object, orm.RobotState, orm.TaskTreeNode):
         rows = await planned.all(select(mapped))
         assert rows
         assert {each.process_metadata_id for each in rows} == {metadata.id}
-    assert await planned.all(select(ParkArmsAction)) == []
+    assert await planned.all(select(orm.ParkArmsAction)) == []
 
 
 async def test_meta_data_alternation(tmp_path: Path) -> None:
@@ -161,13 +110,13 @@ async def test_meta_data_alternation(tmp_path: Path) -> None:
         with kitchen():
             for description in ("meta_data_alternation_test", "and another"):
                 async with memory.episode(description=description):
-                    await ParkArmsActionPerformable(Arms.LEFT).perform()
-    parked = await Recorded(tmp_path).all(select(ParkArmsAction).order_by(ParkArmsAction.id))
+                    await plan.ParkArmsActionPerformable(Arms.LEFT).perform()
+    parked = await Recorded(tmp_path).all(select(orm.ParkArmsAction).order_by(orm.ParkArmsAction.id))
     assert [each.process_metadata.description for each in parked] == ["meta_data_alternation_test", "and another"]
 
 
 async def test_pose(planned: Recorded) -> None:
-    for pose in await planned.all(select(PoseRow)):
+    for pose in await planned.all(select(orm.Pose)):
         assert (pose.position.x, pose.position.y, pose.position.z) == (pose.x, pose.y, pose.z)
         turn = pose.orientation
         assert (turn.x, turn.y, turn.z, turn.w) == (pose.qx, pose.qy, pose.qz, pose.qw)
@@ -175,7 +124,7 @@ async def test_pose(planned: Recorded) -> None:
 
 
 async def test_pose_mixin(planned: Recorded) -> None:
-    states = await planned.all(select(RobotState))
+    states = await planned.all(select(orm.RobotState))
     assert len(states) == 14
     for state in states:
         assert state.pose_id == state.pose.id
@@ -188,16 +137,16 @@ async def test_pose_mixin(planned: Recorded) -> None:
 
 async def test_plan_serialization(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
-        with kitchen(), collected_tree() as tree:
+        with kitchen(), plan.collected_tree() as tree:
             await common_plan()
     recorded = Recorded(tmp_path)
-    performed = len(await recorded.all(select(Action))) + len(await recorded.all(select(Motion)))
+    performed = len(await recorded.all(select(orm.Action))) + len(await recorded.all(select(orm.Motion)))
     assert len(tree) == performed == 14
 
 
 async def test_code_designator_type(planned: Recorded) -> None:
     first, second, *_ = await planned.all(
-        select(TaskTreeNode).where(TaskTreeNode.action_id.is_not(None)).order_by(TaskTreeNode.start_ns)
+        select(orm.TaskTreeNode).where(orm.TaskTreeNode.action_id.is_not(None)).order_by(orm.TaskTreeNode.start_ns)
     )
     assert [each.action.dtype for each in (first, second)] == ["NavigateAction", "MoveMotion"]
     assert first.start_time <= datetime.now(UTC)
@@ -208,21 +157,21 @@ async def test_code_designator_type(planned: Recorded) -> None:
 async def test_parkArmsAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen():
-            await ParkArmsActionPerformable(Arms.BOTH).perform()
-    park = await Recorded(tmp_path).one(select(ParkArmsAction))
+            await plan.ParkArmsActionPerformable(Arms.BOTH).perform()
+    park = await Recorded(tmp_path).one(select(orm.ParkArmsAction))
     assert (park.dtype, park.arm) == ("ParkArmsAction", Arms.BOTH)
 
 
 async def test_transportAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen() as scene:
-            await MoveTorsoActionPerformable(0.3).perform()
+            await plan.MoveTorsoActionPerformable(0.3).perform()
             island = Pose([-1.35, 0.78, 0.95], yaw_quaternion(math.pi))
-            await TransportActionPerformable(scene.milk, Arms.LEFT, island).perform()
+            await plan.TransportActionPerformable(scene.milk, Arms.LEFT, island).perform()
             resting = scene.milk.pose
     recorded = Recorded(tmp_path)
-    transport = await recorded.one(select(TransportAction))
-    milk = await recorded.all(select(Object).where(Object.name == "milk").order_by(Object.id))
+    transport = await recorded.one(select(orm.TransportAction))
+    milk = await recorded.all(select(orm.Object).where(orm.Object.name == "milk").order_by(orm.Object.id))
     assert transport.object.id == milk[0].id
     assert at(transport.object.pose) == at(milk[0].pose) == (1.3, 1, 0.9)
     assert at(transport.pose) == (-1.35, 0.78, 0.95)
@@ -232,37 +181,37 @@ async def test_transportAction(tmp_path: Path) -> None:
 async def test_lookAt_and_detectAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen() as scene:
-            await ParkArmsActionPerformable(Arms.BOTH).perform()
-            await NavigateActionPerformable(Pose([0, 1, 0])).perform()
-            await LookAtActionPerformable(scene.milk.pose).perform()
-            detected = await DetectActionPerformable(scene.milk).perform()
+            await plan.ParkArmsActionPerformable(Arms.BOTH).perform()
+            await plan.NavigateActionPerformable(Pose([0, 1, 0])).perform()
+            await plan.LookAtActionPerformable(scene.milk.pose).perform()
+            detected = await plan.DetectActionPerformable(scene.milk).perform()
             assert detected.world_object is scene.milk
     recorded = Recorded(tmp_path)
-    assert at((await recorded.one(select(LookAtAction))).pose) == (1.3, 1, 0.9)
-    detect = await recorded.one(select(DetectAction))
+    assert at((await recorded.one(select(orm.LookAtAction))).pose) == (1.3, 1, 0.9)
+    detect = await recorded.one(select(orm.DetectAction))
     assert (detect.object.name, detect.object.obj_type) == ("milk", ObjectType.MILK)
 
 
 async def test_setGripperAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen():
-            await SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
-    gripper = await Recorded(tmp_path).one(select(SetGripperAction))
+            await plan.SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
+    gripper = await Recorded(tmp_path).one(select(orm.SetGripperAction))
     assert (gripper.gripper, gripper.motion) == (Arms.LEFT, GripperState.OPEN)
 
 
 async def test_open_and_closeAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen() as scene:
-            handle = Part("sink_area_drawer_handle", scene.kitchen)
-            await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
-            await MoveTorsoActionPerformable(0.1).perform()
-            await OpenActionPerformable(handle, Arms.LEFT).perform()
-            await Close(handle, [Arms.LEFT]).resolve().perform()
+            handle = plan.ObjectPart("sink_area_drawer_handle", scene.kitchen)
+            await plan.NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+            await plan.MoveTorsoActionPerformable(0.1).perform()
+            await plan.OpenActionPerformable(handle, Arms.LEFT).perform()
+            await plan.CloseAction(handle, [Arms.LEFT]).resolve().perform()
     recorded = Recorded(tmp_path)
-    opened, closed = await recorded.one(select(OpenAction)), await recorded.one(select(CloseAction))
+    opened, closed = await recorded.one(select(orm.OpenAction)), await recorded.one(select(orm.CloseAction))
     for action in (opened, closed):
-        assert isinstance(action.object, ObjectPart)
+        assert isinstance(action.object, orm.ObjectPart)
         assert action.object.name == "sink_area_drawer_handle"
         assert action.object.part_of is not None
         assert action.object.part_of.name == "kitchen"
@@ -275,26 +224,13 @@ async def test_view_creation(planned: Recorded) -> None:
     with closing(sqlite3.connect(planned.folder / "memory.db")) as file, file:
         kinds = file.execute("SELECT type FROM sqlite_schema WHERE name = 'PickUpWithContextView'").fetchall()
         columns = [name for _, name, *_ in file.execute("PRAGMA table_info('PickUpWithContextView')")]
-    file.close()
     assert kinds == [("view",)]
-    assert columns[:12] == [
-        "id",
-        "arm",
-        "grasp",
-        "torso_height",
-        "relative_x",
-        "relative_y",
-        "quaternion_x",
-        "quaternion_y",
-        "quaternion_z",
-        "quaternion_w",
-        "obj_type",
-        "status",
-    ]
+    expected = "id arm grasp torso_height relative_x relative_y quaternion_x quaternion_y quaternion_z quaternion_w"
+    assert columns[:12] == [*expected.split(), "obj_type", "status"]
 
 
 async def test_pickUpWithContextView(planned: Recorded) -> None:
-    row = await planned.one(select(PickUpWithContextView))
+    row = await planned.one(select(orm.PickUpWithContextView))
     assert (row.arm, row.grasp, row.torso_height) == (Arms.LEFT, Grasp.FRONT, 0.3)
     assert (row.relative_x, row.relative_y) == (pytest.approx(-0.7, abs=1e-6), pytest.approx(-0.6, abs=1e-6))
     assert (row.quaternion_x, row.quaternion_y, row.quaternion_z, row.quaternion_w) == (0, 0, 0, 1)
@@ -302,8 +238,8 @@ async def test_pickUpWithContextView(planned: Recorded) -> None:
 
 
 async def test_pickUpWithContextView_conditions(planned: Recorded) -> None:
-    assert await planned.all(select(PickUpWithContextView).where(PickUpWithContextView.arm == Arms.RIGHT)) == []
-    left = select(func.count()).where(PickUpWithContextView.arm == Arms.LEFT)
+    assert await planned.all(select(orm.PickUpWithContextView).where(orm.PickUpWithContextView.arm == Arms.RIGHT)) == []
+    left = select(func.count()).where(orm.PickUpWithContextView.arm == Arms.LEFT)
     assert await planned.all(left) == [1]
 
 
