@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, settings
 
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.bullet import reuse_clients
 from tests.commands import fork_child
 from tests.databases import Server, put_memory, server_in_memory
 from tests.long_modules import long_modules_first
@@ -100,6 +101,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+reuse_clients()
 gc.disable()  # until all tests are collected: nothing becomes garbage while modules are imported
 
 
