@@ -1,10 +1,8 @@
 """Every script of `bench/` runs and prints its figures, and the page shows each with the verdict of its budget."""
 
-import ast
 import json
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -52,104 +50,6 @@ def test_a_quick_run_is_not_compared_with_a_budget() -> None:
     assert result == Verdict("not measured", None)
 
 
-def test_the_largest_measured_number_of_nodes_is_judged() -> None:
-    def of(*sizes: tuple[int, float]) -> dict[str, Any]:
-        return {**ABOUT, "sqlite": [{"nodes": nodes, "times_faster": {"median": times}} for nodes, times in sizes]}
-
-    lines = {"thesis": of((1_000, 70.0), (50_000, 60.0)), "thesis, 488,043 nodes": of((488_043, 49.9))}
-    result = verdict("spool", lines)
-    assert result == Verdict("49.9 times at 488,043 nodes", met=False)
-
-
-def test_mapped_objects_are_judged_on_both_databases() -> None:
-    def of(sqlite: float, postgresql: float) -> dict[str, Any]:
-        ratios = {"sqlite": sqlite, "postgresql": postgresql}
-        return {
-            "objects": {**ABOUT, **{name: {"actions": {"ours_is": {"median": is_}}} for name, is_ in ratios.items()}}
-        }
-
-    assert verdict("CPU time of `select(Action)`", of(0.7, 1.0)) == Verdict(
-        "sqlite 0.70 times, postgresql 1.00 times", met=True
-    )
-    assert verdict("CPU time of `select(Action)`", of(0.7, 1.1)).met is False
-
-
-def test_a_common_cue_is_judged_beside_soar_where_it_is_installed() -> None:
-    def of(common: float, soar: dict[str, Any] | str, p99: float = 9.0) -> dict[str, Any]:
-        kinds = {"common": {"median": common, "p99": 1.0}, "rare": {"median": 1.0, "p99": p99}}
-        return {"recall": {**ABOUT, "1,000,000": {"recall_ms": kinds, "soar": soar, "bytes_an_action": 62.2}}}
-
-    slower = {"recall_ms": {"common": {"median": 0.1}}}
-    common, kinds = "recall of a common cue", "recall by every kind"
-    assert verdict(common, of(0.05, slower)) == Verdict("0.05 ms, Soar 0.1 ms", met=True)
-    assert verdict(common, of(0.15, slower)).met is False
-    assert verdict(common, of(0.15, "missing")) == Verdict("0.15 ms", met=True)
-    assert verdict(kinds, of(0.1, slower)) == Verdict("9 ms (rare), 62.2 bytes an action", met=True)
-    assert verdict(kinds, of(0.1, slower, p99=10.5)).met is False
-
-
-def test_cases_are_judged_on_both_databases_and_by_their_growth() -> None:
-    def of(fold_us: float, load_ms: float, large_ms: float) -> dict[str, Any]:
-        figures = {"fold_cpu_us_an_action": {"median": fold_us}, "load_ms": {"median": load_ms}}
-        sizes = {"1,000,000": 1.0}, {"10,000,000": large_ms}
-        recalls = [
-            {size: {"recall_ms": {"rare": {"median": ms}}, "bytes_an_action": 60} for size, ms in each.items()}
-            for each in sizes
-        ]
-        cases: dict[str, Any] = {"sqlite": figures, "postgresql": figures}
-        lines: dict[str, dict[str, Any]] = {"cases": cases, "recall": recalls[0], "recall, large": recalls[1]}
-        return {name: {**ABOUT, **each} for name, each in lines.items()}
-
-    fold, load, growth = "making the case", "loading the cases", "recall among"
-    assert verdict(fold, of(25, 100, 11)) == Verdict("sqlite 25 µs, postgresql 25 µs", met=True)
-    assert verdict(fold, of(25.1, 100, 11)).met is False
-    assert verdict(load, of(25, 100, 11)) == Verdict("sqlite 100 ms, postgresql 100 ms", met=True)
-    assert verdict(load, of(25, 101, 11)).met is False
-    assert verdict(growth, of(25, 100, 11)) == Verdict("1.10 times an action (rare), 60 bytes an action", met=True)
-    assert verdict(growth, of(25, 100, 11.5)).met is False
-
-
-def test_the_wall_time_of_mapped_objects_is_shown_beside_that_of_the_thesis() -> None:
-    def of(sqlite_ms: int, postgresql_ms: int) -> dict[str, Any]:
-        sides = {
-            name: {"actions": {"ours_ms": {"median": ms}, "thesis_ms": {"median": 1_500}}}
-            for name, ms in (("sqlite", sqlite_ms), ("postgresql", postgresql_ms))
-        }
-        return {"objects": {**ABOUT, **sides}}
-
-    assert verdict("the same, wall time", of(1_000, 250)) == Verdict(
-        "sqlite 1.00 s (system of the thesis: 1.50 s), postgresql 0.25 s (system of the thesis: 1.50 s),"
-        " at a load of 0.1 to 2.0",
-        met=True,
-    )
-    assert verdict("the same, wall time", of(1_001, 250)).met is False
-    assert verdict("the same, wall time", of(1_000, 251)).met is False
-
-
-def test_of_all_rebuilt_logs_the_largest_is_judged() -> None:
-    def of(database: str, events: int, times: float, mb: float) -> dict[str, Any]:
-        sizes = [{"events": 100}, {"events": events}]
-        return {**ABOUT, "database": database, "by_workers": {"1": sizes}, "growth": {"1": _grown(times, mb)}}
-
-    lines = {
-        "rebuild": of("sqlite", 1_000, 1.2, 0),
-        "rebuild, large": of("sqlite", 10_000, 1.1, 16.0),
-        "rebuild postgresql": of("postgresql", 1_000, 0.9, -1.0),
-    }
-    result = verdict("rebuild, the largest log", lines)
-    assert result == Verdict(
-        "sqlite 1.10 times, +16 MB (100 to 10,000 events), postgresql 0.90 times, -1 MB (100 to 1,000 events)",
-        met=True,
-    )
-    for worse in (_grown(1.11, 0), _grown(1.0, 16.1)):
-        lines["rebuild, large"]["growth"] = {"1": worse}
-        assert verdict("rebuild, the largest log", lines).met is False
-
-
-def _grown(times: float, mb: float) -> dict[str, float]:
-    return {"us_per_event": times, "mb": mb}
-
-
 def test_a_missing_library_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
     message = "missing: install the extra 'bench'"
     lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": message}}}
@@ -191,18 +91,6 @@ def test_the_readme_shows_the_budgets_as_they_were_measured() -> None:
     budgets = measured[measured.index("| measurement | budget |") :].split("\n\n")[0]
     assert len(budgets.splitlines()) == 2 + len(BUDGETS)
     assert budgets in (ROOT / "bench" / "README.md").read_text()
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "bench").rglob("*.py")), ids=lambda each: each.stem)
-def test_every_name_that_the_bench_imports_still_exists(path: Path) -> None:
-    """Most scripts run on demand only, so that a renamed import would otherwise stay unnoticed until the next run."""
-    tree = ast.parse(path.read_text())
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("pycrorm_async"):
-            module = import_module(node.module)
-            for each in node.names:
-                if not hasattr(module, each.name):
-                    import_module(f"{node.module}.{each.name}")  # a module, which must exist
 
 
 # === quick ====================================================================================================

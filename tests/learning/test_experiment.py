@@ -19,14 +19,12 @@ import pytest
 from pycrorm_async import Reading, recover
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of
-from pycrorm_async.learning import rollouts as recorded_rollouts
 from pycrorm_async.learning.experiment import (
     Experiment,
     ExperimentResult,
     pick_up_in_kitchen,
     read_rollouts,
     run,
-    scene_variants,
     study,
 )
 from pycrorm_async.learning.pool import Job, MemoryLocation, WorkerLost, Workers
@@ -249,13 +247,6 @@ async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
     assert studied.curve == ()
 
 
-@pytest.mark.parametrize("collisions", [True, False])
-def test_a_policy_is_evaluated_elsewhere_with_collisions_and_without(collisions: bool) -> None:
-    scenes = scene_variants(Scene(collisions=collisions))
-    assert len(set(scenes)) == len(scenes)
-    assert replace(scenes[0], collisions=not collisions) in scenes
-
-
 async def test_too_few_successes_are_reported_and_all_rollouts_kept(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(NotEnoughExperience, match=r"too few to learn from: a leaf takes 25; .* --min-samples-leaf"):
@@ -294,17 +285,6 @@ async def test_rollouts_are_not_repeated_when_learning_from_them_had_failed(
     learned = await run(replace(twice, resume=True), place)
     assert [(each.tally.rollouts, each.done_now) for each in learned.phases] == [(200, 0), (200, 0), (10, 10), (10, 10)]
     assert learned_from[2:] == learned_from[:2]
-
-
-async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:
-    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
-    async with Workers(2, place) as workers:
-        job = Job(Scene(), default_policy(), 5, episode_each=True)
-        tally = await workers.roll_out(job, [(0, 15), (15, 15)])
-        assert ask(place.url, "SELECT count(*) FROM process_metadata") == [(30,)]
-    async with Reading.open(place.url) as reading:
-        frame = await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 30)
-    assert recorded_rollouts.tally_of(frame) == tally
 
 
 async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tmp_path: Path) -> None:

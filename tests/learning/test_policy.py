@@ -94,11 +94,6 @@ def test_likelihoods_are_probability_times_density() -> None:
     assert TWO.likelihood([]).tolist() == []
 
 
-def test_the_first_and_the_last_knot_belong_to_a_leaf() -> None:
-    ends = [PickUpChoice(Arms.LEFT, Grasp.FRONT, x, y) for x in (-1.0, -0.5) for y in (0.0, 0.5)]
-    assert (TWO.likelihood(ends) > 0).all()
-
-
 def test_evidence_on_the_height_changes_the_weights_of_the_leaves() -> None:
     low, high = TWO.condition(Evidence(height=(0.5, 0.6))), TWO.condition(Evidence(height=(0.75, 0.9)))
     assert low.probability(Evidence(arms=LEFT)) == pytest.approx(1.0)
@@ -184,12 +179,6 @@ def test_the_least_and_the_most_likely_draws_are_possible_too(drawn: float) -> N
     for policy in (TWO.condition(Evidence(region=region)), default_policy(), default_policy().condition(NEAR)):
         (choice,) = policy.sample(Fixed())  # type: ignore[arg-type]
         assert policy.coverage([choice]) == 1.0
-
-
-def test_sampling_does_not_change_the_global_generator() -> None:
-    before = np.random.get_state(legacy=False)["state"]
-    TWO.sample(np.random.default_rng(6), 50)
-    assert repr(np.random.get_state(legacy=False)["state"]) == repr(before)
 
 
 def test_the_mode_is_the_square_with_the_highest_probability() -> None:

@@ -21,7 +21,6 @@ from pycrorm_async.learning import (
     Tally,
     batch_rollout,
     default_policy,
-    learn,
     name_of,
     rollouts,
     rollouts_question,
@@ -85,12 +84,6 @@ async def test_within_hard_limits_the_same_rollouts_succeed_and_more() -> None:
     pairs = list(zip(succeeded[Limits.SOFT], succeeded[Limits.HARD], strict=True))
     assert (False, True) in pairs
     assert (True, False) not in pairs
-
-
-@pytest.mark.soak  # sixty rollouts above
-async def test_within_hard_limits_twice_as_many_succeed() -> None:
-    tally = await rolled_out(2_000, scene=Scene(limits=Limits.HARD))
-    assert 0.27 < tally.success_rate < 0.33
 
 
 async def test_every_rollout_ends_as_geometry_and_inverse_kinematics_alone_predict() -> None:
@@ -244,19 +237,6 @@ async def test_rollouts_that_were_repeated_count_once(tmp_path: Path) -> None:
             await rolled_out(count, first=first)
         frame = rollouts.drop_repeats(await frame_of(memory))
         assert frame["index"].tolist() == list(range(30))
-
-
-@pytest.mark.soak  # test_experiment learns from a memory too
-async def test_a_policy_learned_from_the_memory_succeeds_more_often(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
-        default = await rolled_out(1_500)
-        await memory.flush()
-        frame = await memory.dataframe(MoveAndPickUp.query_for_database())
-        assert len(frame) == default.successes
-        policy = learn(frame)
-        assert policy.constant_height == pytest.approx(0.9)
-    learned = await rolled_out(400, seed=70, policy=policy)
-    assert learned.success_rate > 0.5 > 3 * default.success_rate - 0.1
 
 
 async def test_a_fault_in_the_plan_ends_the_batch(tmp_path: Path) -> None:

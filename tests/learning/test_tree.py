@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,9 +22,6 @@ from pycrorm_async.learning.policy import (
     Rectangle,
     Region,
     default_policy,
-    load_policy,
-    name_of,
-    save_policy,
 )
 from pycrorm_async.learning.tree import learn
 from pycrorm_async.world.pose import Arms, Grasp
@@ -102,18 +97,6 @@ def test_all_successes_it_learned_from_are_possible_and_regions_without_one_are_
         learned.condition(Evidence(grasps=frozenset({Grasp.TOP})))
 
 
-def test_likelihoods_equal_those_of_pyjpt(learned: Policy, oracle: Any, successes: list[PickUpChoice]) -> None:
-    choices = [*successes, *learned.sample(np.random.default_rng(2), 200)]
-    coded = frame_of(choices).assign(
-        arm=[each.arm - 1 for each in choices], grasp=[each.grasp.value for each in choices]
-    )
-    # its JPT.likelihood omits the weights of the leaves
-    theirs = sum(leaf.prior * leaf.likelihood(coded)[:, 0] for leaf in oracle.leaves.values())
-    alike = np.isclose(learned.likelihood(choices), theirs, rtol=1e-6)
-
-    assert alike.all()
-
-
 def test_the_leaves_equal_those_of_pyjpt_in_order_and_to_the_digit(learned: Policy, oracle: Any) -> None:
     rows = sum(leaf.samples for leaf in oracle.leaves.values())
     theirs = []
@@ -141,43 +124,8 @@ def test_probabilities_and_conditioned_ones_equal_those_of_pyjpt(learned: Policy
             assert ours.probability(conditions) == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize("generators", [20, pytest.param(100, marks=pytest.mark.soak)])
-def test_many_generators_never_fail_and_repeat_themselves(learned: Policy, generators: int) -> None:
-    region = Region((Rectangle(-0.9, 0.0, -0.9, 0.9), Rectangle(0.0, 0.9, 0.2, 0.9)))
-    conditioned = learned.condition(Evidence(frozenset({Arms.RIGHT}), frozenset({Grasp.LEFT, Grasp.FRONT}), region))
-    for seed in range(generators):
-        choices = learned.sample(np.random.default_rng(seed), 2000)
-        assert learned.coverage(choices) == 1.0
-        assert choices == learned.sample(np.random.default_rng(seed), 2000)
-        kept = conditioned.sample(np.random.default_rng(seed), 200)
-        assert conditioned.coverage(kept) == 1.0
-        assert {each.arm for each in kept} == {Arms.RIGHT}
-        assert {each.grasp for each in kept} <= {Grasp.LEFT, Grasp.FRONT}
-        assert all(abs(x) <= 0.9 and (x <= 0.0 or y >= 0.2) and abs(y) <= 0.9 for _, _, x, y in kept)
-
-
-def test_samples_are_distributed_as_the_successes(learned: Policy, successes: list[PickUpChoice]) -> None:
-    drawn = learned.sample(np.random.default_rng(3), 20_000)
-    for part in (2, 3):
-        apart = [
-            np.quantile([each[part] for each in drawn], share) - np.quantile([each[part] for each in successes], share)
-            for share in np.linspace(0.05, 0.95, 10)
-        ]
-        assert max(map(abs, apart)) < 0.05
-
-
 def test_learning_again_yields_the_same_policy(learned: Policy, successes: list[PickUpChoice]) -> None:
     assert learn(frame_of(successes)) == learned
-
-
-@pytest.mark.soak  # test_policy reads one there
-def test_a_learned_policy_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
-    from tests.learning.test_policy import ELSEWHERE
-
-    save_policy(learned, tmp_path / "policy.json")
-    elsewhere = [sys.executable, "-c", ELSEWHERE, str(tmp_path / "policy.json")]
-    said = subprocess.run(elsewhere, check=True, capture_output=True, text=True).stdout
-    assert json.loads(said) == learned.likelihood(learned.sample(np.random.default_rng(8), 500)).tolist()
 
 
 FIRST_OF_ALL = """
@@ -235,17 +183,6 @@ def test_base_positions_are_learned_for_each_height() -> None:
     assert policy.probability(Evidence(height=(0.6, 0.8))) == pytest.approx((heights < 0.8).mean(), abs=0.02)
     with pytest.raises(ImpossibleCondition, match=r"height 1\.500 to 1\.600 m"):
         policy.condition(Evidence(height=(1.5, 1.6)))
-
-
-def test_a_few_heights_are_distinguished() -> None:
-    heights = np.repeat([0.6, 0.9], 100)
-    places = np.tile(np.linspace(-0.05, 0.05, 100), 2)
-    frame = pd.DataFrame(
-        {"arm": "LEFT", "grasp": "TOP", "object_x": np.sign(heights - 0.7) + places, "object_y": places[::-1]}
-    ).assign(height=heights)
-    policy = learn(frame)
-    assert policy.probability(Evidence(height=(0.59, 0.61))) == pytest.approx(0.5)
-    assert all(each.relative_x > 0.9 for each in policy.condition(Evidence(height=(0.89, 0.91))).sample(rng(), 100))
 
 
 def test_from_a_single_base_position_only_that_one_is_learned() -> None:
@@ -354,10 +291,7 @@ def rng() -> np.random.Generator:
 
 # === large tree ===============================================================================================
 #
-# A tree with far more leaves than Python's recursion limit: learned, queried, saved and read again.
-
-SQUARE = Rectangle(0.0, 1.0, 0.0, 1.0)
-BESIDE = Evidence(region=Region((SQUARE,)), height=(-0.1, 0.1))
+# A tree with far more leaves than Python's recursion limit.
 
 
 @pytest.fixture(scope="module")
@@ -375,20 +309,3 @@ def test_a_tree_has_more_leaves_than_python_nests_calls(learned_large: Policy, c
     assert len(learned_large.leaves) > sys.getrecursionlimit()
     assert learned_large.coverage(choices) == 1.0
     assert learned_large.probability(LEFT) == pytest.approx(np.mean([each.arm is Arms.LEFT for each in choices]))
-
-
-def test_a_large_tree_answers_under_evidence(learned_large: Policy) -> None:
-    conditioned = learned_large.condition(LEFT).condition(BESIDE)
-    drawn = conditioned.sample(np.random.default_rng(7), 500)
-    assert {each.arm for each in drawn} == {Arms.LEFT}
-    assert all(0 <= each.relative_x <= 1 and 0 <= each.relative_y <= 1 for each in drawn)
-    assert (conditioned.likelihood(drawn) > 0).all()
-    assert conditioned.probability(LEFT) == pytest.approx(1.0)
-    assert conditioned.mode().probability(BESIDE) == pytest.approx(1.0)
-
-
-def test_a_large_tree_is_the_same_from_its_file(learned_large: Policy, tmp_path: Path) -> None:
-    save_policy(learned_large, tmp_path / "policy.json")
-    loaded = load_policy(tmp_path / "policy.json")
-    assert loaded == learned_large
-    assert name_of(loaded) == name_of(learned_large)

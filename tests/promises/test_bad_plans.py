@@ -43,8 +43,6 @@ pytestmark = pytest.mark.slow
 #
 # An impossible action is recorded with class, message and data at every node it passes, and the plan continues.
 
-FAR = Pose([9, 9, 1], time_ns=1)
-
 
 @dataclass
 class AttemptActionPerformable(ActionAbstract):

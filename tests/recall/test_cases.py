@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import os
 import signal
 from collections import Counter
@@ -47,6 +46,7 @@ from pycrorm_async.recall.recall import Recall
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.commands import FORKED, fork
 from tests.golden.unpacking import unpack_memory, unpack_memory_v1
 from tests.golden.zoo import ZOO
 from tests.memory.note_actions import NoteActionPerformable
@@ -386,8 +386,8 @@ async def test_a_fold_that_is_killed_in_a_block_or_a_merge_continues(
     plain = Projector(log)
     await plain.open()
     await plain.catch_up()
-    process = multiprocessing.get_context("spawn").Process(target=_die, args=(database_url, place, last))
-    process.start()
+    process = FORKED.Process(target=_die, args=(database_url, place, last))
+    fork(process)
     await asyncio.to_thread(process.join)
     assert process.exitcode == -signal.SIGKILL
     expected = cases_of(*scripts)

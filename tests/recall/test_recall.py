@@ -19,14 +19,12 @@ from pycrorm_async.recall import recall as running_cases
 from pycrorm_async.recall.answer import Answer, Relation
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import ProcessCases, Recall
-from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms
 from tests.recall.sliding_grips import (
     FETCH,
     GRIP,
     FetchSlidingActionPerformable,
     GripSlidingActionPerformable,
-    SlipperyFailure,
     grip,
     record,
 )
@@ -150,14 +148,6 @@ async def test_from_a_case_one_gets_to_what_was_around_it(recall: Recall) -> Non
     assert [node.dtype for node in moment.running if node.dtype is not None] == [FETCH, GRIP]
     with pytest.raises(CallerError, match="'inside' is not a relation: give one of before, meets"):
         await recall.related(parent, "inside")
-
-
-async def test_what_follows_is_counted(recall: Recall) -> None:
-    after = await recall.follows(GripSlidingActionPerformable, reason=SlipperyFailure)
-    assert next((each.type, each.cases) for each in after.followers) == (GRIP, 3)
-    assert after.cases == 4
-    for status in ("failed", TaskStatus.FAILED):
-        assert await recall.follows(GRIP, status=status, reason="SlipperyFailure") == after
 
 
 async def test_what_is_like_a_case_does_not_contain_it(recall: Recall) -> None:

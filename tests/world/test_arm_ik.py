@@ -7,7 +7,6 @@ import math
 import random
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -33,7 +32,7 @@ from pycrorm_async.world import (
 )
 from pycrorm_async.world.kinematics import Unreachable, chain_of, forward, solve, solve_from
 from pycrorm_async.world.models import built_in_model
-from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
+from pycrorm_async.world.pose import Arms, Grasp, Pose, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
 from pycrorm_async.world.world_copy import counterpart
 from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
@@ -288,50 +287,6 @@ def test_a_robot_without_a_description_is_the_callers_error() -> None:
 # --- the default policy of the thesis ---------------------------------------------------------------------------------
 
 
-def default_pick_up(rng: random.Random) -> tuple[Arms, Grasp, Pose, list[Pose]]:
-    """Return a random base pose around milk at (1.3, 1, 0.9) that faces it, arm, grasp, and the three poses of a
-    pick-up.
-    """
-    arm, grasp = rng.choice(ARMS), rng.choice(list(Grasp))
-    x = y = 0.0
-    while max(abs(x), abs(y)) < 0.2 or max(abs(x), abs(y)) > 2:
-        x, y = rng.gauss(0, math.sqrt(0.5)), rng.gauss(0, math.sqrt(0.5))
-    milk = Vector(1.3, 1.0, 0.9)
-    base = Pose([milk.x + x, milk.y + y, 0], yaw_quaternion(math.atan2(-y, -x)))
-    turn = product(Quaternion(0, 0, 0, 1), GRASP_ORIENTATIONS[grasp])
-    back = rotated(base.orientation, (-0.1, 0.0, 0.0))
-    before = (milk.x + back.x, milk.y + back.y, milk.z)
-    above = (milk.x, milk.y, milk.z + 0.03)
-    return arm, grasp, base, [Pose(place, turn) for place in (before, milk, above)]
-
-
-def picked_up(limits: Limits, *, attempts: int) -> tuple[float, dict[Grasp, float]]:
-    """Return the percentage of attempts that succeed: of all, and of those with each grasp."""
-    rng = random.Random(69)
-    tried: Counter[Grasp] = Counter()
-    done: Counter[Grasp] = Counter()
-    for _ in range(attempts):
-        arm, grasp, base, targets = default_pick_up(rng)
-        tried[grasp] += 1
-        try:
-            for target in targets:
-                solve_from(PR2, arm, target, base=base, torso_height=0.0, limits=limits)
-        except Unreachable:
-            continue
-        done[grasp] += 1
-    return 100 * done.total() / attempts, {grasp: 100 * done[grasp] / tried[grasp] for grasp in Grasp}
-
-
-@pytest.mark.slow
-@pytest.mark.soak
-def test_hard_limits_double_the_success_of_the_default_policy_and_allow_grasps_from_above() -> None:
-    soft, soft_by_grasp = picked_up(Limits.SOFT, attempts=2000)
-    hard, hard_by_grasp = picked_up(Limits.HARD, attempts=2000)
-    assert 1.7 < hard / soft < 2.2
-    assert soft_by_grasp[Grasp.TOP] == 0
-    assert hard_by_grasp[Grasp.TOP] > 26
-
-
 def test_another_torso_height_has_the_solution_of_that_torso_and_nothing_moves() -> None:
     with BulletWorld():
         robot = Object("pr2", ObjectType.ROBOT)
@@ -530,7 +485,7 @@ def test_an_arm_without_a_joint_is_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("targets", "reached_min"), [(50, 6), pytest.param(150, 20, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(("targets", "reached_min"), [(20, 2), pytest.param(150, 20, marks=pytest.mark.soak)])
 def test_the_general_solver_reaches_what_the_closed_form_reaches(targets: int, reached_min: int) -> None:
     general = RobotDescription(
         name="pr2",

@@ -19,7 +19,6 @@ from pycrorm_async.world.pose import (
     DuplicateName,
     JointLimitExceeded,
     MalformedPose,
-    NoWorld,
     ObjectNotInWorld,
     ObjectRefused,
     PoseRefused,
@@ -47,10 +46,6 @@ def test_the_pose_read_is_exactly_the_pose_set(world: BulletWorld) -> None:
     milk.set_pose(there)
     assert milk.pose is there
     assert milk.link_pose() is there
-
-
-def test_without_a_pose_an_object_is_at_the_origin(world: BulletWorld) -> None:
-    assert Object("bowl", ObjectType.BOWL).pose == Pose([0, 0, 0], [0, 0, 0, 1])
 
 
 @pytest.mark.parametrize("base", [Pose(), LEANING])
@@ -88,14 +83,6 @@ def test_a_link_pose_at_other_joint_positions_moves_nothing_and_notifies_no_obse
         placed_crane.link_pose_at("hook", {"rowing": 1.0})
 
 
-def test_links_follow_a_base_that_is_set_after_the_joints(world: BulletWorld) -> None:
-    placed_crane = crane()
-    placed_crane.set_joint_positions({"turning": 0.4, "reaching": 0.6})
-    placed_crane.set_pose(LEANING)
-    expected = crane_links(LEANING, turning=0.4, lifting=0, reaching=0.6)
-    np.testing.assert_allclose(matrix(placed_crane.link_pose("hook")), expected["hook"], atol=1e-9)
-
-
 def test_joints_and_links_have_the_names_kinds_and_limits_of_the_description(world: BulletWorld) -> None:
     placed_crane = crane()
     assert placed_crane.links[0] == "foot"
@@ -125,13 +112,6 @@ def test_one_motion_of_joints_is_reported_once_with_all_of_them(world: BulletWor
         ("joints", "crane", {"reaching": 0.1}),
     ]
     assert placed_crane.joint_positions() == {"turning": 1.5, "lifting": 0.0, "reaching": 0.1}
-
-
-def test_a_motion_of_no_joints_is_ignored(world: BulletWorld, change_log: ChangeLog) -> None:
-    placed_crane = crane()
-    change_log.notes.clear()
-    placed_crane.set_joint_positions({})
-    assert change_log.notes == []
 
 
 def test_a_base_motion_is_reported_once_even_without_a_change(world: BulletWorld, change_log: ChangeLog) -> None:
@@ -257,11 +237,6 @@ def test_a_name_is_used_once_in_a_world(world: BulletWorld) -> None:
         Object("crane", ObjectType.MILK)
     world.remove(world.object("crane"))
     assert Object("crane", ObjectType.MILK).object_type is ObjectType.MILK
-
-
-def test_an_object_needs_a_world() -> None:
-    with pytest.raises(NoWorld, match="'milk'"):
-        Object("milk", ObjectType.MILK)
 
 
 def test_reset_of_an_object_reports_only_its_changes(world: BulletWorld, change_log: ChangeLog) -> None:

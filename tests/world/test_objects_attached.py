@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pycrorm_async.world import BoundingBox, BulletWorld, Object, ObjectType, Pose, Vector
+from pycrorm_async.world import BoundingBox, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import AttachmentRefused, ObjectNotInWorld, UnknownLink, yaw_quaternion
 from tests.world.fakes import CRANE, ChangeLog, X, Z, crane_links, matrix, shifted, turned
 
@@ -266,12 +266,6 @@ def test_a_link_without_a_shape_has_a_box_of_size_zero_at_its_frame(world: Bulle
     body = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
     at = body.link_pose("boom").position
     assert body.bounding_box("boom") == BoundingBox(at, at)
-
-
-def test_a_box_has_a_centre_and_a_size() -> None:
-    box = BoundingBox(Vector(0.0, -1.0, 2.0), Vector(1.0, 1.0, 2.5))
-    assert box.centre == Vector(0.5, 0.0, 2.25)
-    assert box.size == Vector(1.0, 2.0, 0.5)
 
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"

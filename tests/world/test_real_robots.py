@@ -35,7 +35,7 @@ URDFS = sorted(each for root in (EXAMPLES, BULLET) for each in root.rglob("*.urd
 SRDFS = sorted(EXAMPLES.rglob("*.srdf"))
 PACKAGES = {"example-robot-data": EXAMPLES.parent}
 AT_EACH_COMMIT = {
-    "panda", "pr2", "tiago_no_hand", "xarm6_with_gripper", "kuka_lwr", "humanoid", "husky", "microtaur", "ur3", "r2d2",
+    "pr2", "tiago_no_hand", "xarm6_with_gripper", "kuka_lwr", "humanoid", "husky", "microtaur", "ur3", "r2d2",
     "biped2d_pybullet", "finger_edu", "racecar", "door", "alex_psyonic_hands",
 }  # fmt: skip
 REFUSED = {

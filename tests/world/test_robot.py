@@ -15,7 +15,7 @@ import pycrorm_async
 from pycrorm_async.world.kinematics import forward
 from pycrorm_async.world.models import built_in_model, pr2_mesh_urdf_path
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, product, rotated, yaw_quaternion
-from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits, robot_description
+from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
 from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
 
 BULLET_EXACT = 1e-6
@@ -60,13 +60,6 @@ def model(tmp_path: Path) -> Iterator[LoadedModel]:
     loaded.close()
 
 
-def test_the_model_of_boxes_loads_without_output(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "pr2.urdf"
-    path.write_text(built_in_model("pr2"), encoding="utf-8")
-    LoadedModel(path).close()
-    assert capfd.readouterr() == ("", "")
-
-
 def test_the_model_has_the_pr2s_joints_and_hard_limits_and_no_others(model: LoadedModel) -> None:
     bounded = {name: limits for name, limits in model.limits.items() if name not in CONTINUOUS}
     assert bounded == LEFT_HARD_LIMITS | RIGHT_HARD_LIMITS | OTHER_LIMITS
@@ -84,30 +77,12 @@ def test_the_root_link_of_the_model_is_on_the_floor(model: LoadedModel) -> None:
     assert model.link_pose("torso_lift_link").position == pytest.approx((-0.05, 0, 0.790675), abs=BULLET_EXACT)
 
 
-def test_stretched_arms_end_at_the_sum_of_the_pr2s_link_lengths(model: LoadedModel) -> None:
-    model.put(base=Pose(), joints={})
-    ahead = -0.05 + 0.1 + 0.4 + 0.321 + 0.18
-    for link, side in (("l_gripper_tool_frame", 0.188), ("r_gripper_tool_frame", -0.188)):
-        pose = model.link_pose(link)
-        assert pose.position == pytest.approx((ahead, side, 0.790675), abs=BULLET_EXACT)
-        assert pose.orientation == pytest.approx((0, 0, 0, 1), abs=BULLET_EXACT)
-
-
 def test_the_camera_looks_ahead_from_its_lowest_height_to_its_highest(model: LoadedModel) -> None:
     for torso, height in ((0.0, PR2.camera_height_m.lower), (0.33, PR2.camera_height_m.upper)):
         model.put(base=Pose(), joints={PR2.torso_joint: torso})
         camera = model.link_pose(PR2.camera_link)
         assert camera.position.z == pytest.approx(height, abs=0.001)
         assert rotated(camera.orientation, (0, 0, 1)) == pytest.approx((1, 0, 0), abs=BULLET_EXACT)
-
-
-def test_the_head_turns_left_with_pan_and_down_with_tilt(model: LoadedModel) -> None:
-    model.put(base=Pose(), joints={PR2.head_pan_joint: 0.5, PR2.head_tilt_joint: 0.3})
-    x, y, z = rotated(model.link_pose(PR2.camera_link).orientation, (0, 0, 1))
-    assert (x, y, z) == pytest.approx(
-        (math.cos(0.3) * math.cos(0.5), math.cos(0.3) * math.sin(0.5), -math.sin(0.3)), abs=BULLET_EXACT
-    )
-    assert {PR2.head_pan_link, PR2.head_tilt_link} <= set(model.links)
 
 
 def test_fingers_move_apart_when_opened(model: LoadedModel) -> None:
@@ -132,13 +107,6 @@ def test_forward_kinematics_equals_bullets(model: LoadedModel, arm: Arms) -> Non
         bullets = model.link_pose(PR2.arms[arm].tool_frame)
         assert ours.distance(bullets) < BULLET_EXACT
         assert angle_between(ours.orientation, bullets.orientation) < BULLET_EXACT
-
-
-def test_described_hard_limits_equal_the_models(model: LoadedModel) -> None:
-    for arm in ARMS:
-        for name, bounds in PR2.arms[arm].hard_limits.items():
-            assert name in CONTINUOUS or model.limits[name] == bounds
-    assert model.limits[PR2.torso_joint] == PR2.torso_limits
 
 
 def test_soft_limits_are_inside_the_hard_ones_and_rolls_turn_freely() -> None:
@@ -184,11 +152,6 @@ def test_a_grasp_comes_from_its_side_of_the_object_whatever_its_heading(heading:
     assert points_to[Grasp.LEFT] == pytest.approx([-value for value in leftwards])
     assert points_to[Grasp.RIGHT] == pytest.approx(leftwards)
     assert points_to[Grasp.TOP] == pytest.approx((0, 0, -1))
-
-
-def test_only_the_pr2_is_described() -> None:
-    assert robot_description("pr2") is PR2
-    assert robot_description("hsrb") is None
 
 
 def test_without_the_mesh_package_the_error_names_the_extra_to_install() -> None:
