@@ -6,9 +6,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import InitVar, dataclass, fields
 from typing import Any, Final, Literal, get_args
 
 from pycrorm_async.errors import CallerError
@@ -25,6 +26,8 @@ _MAY_BE_NONE = frozenset({"sample_interval_ms"})
 _MAY_BE_ZERO = frozenset({"keep_stored_bytes", "keep_stored_s", "sample_change_min"})
 _EPISODE_EVENTS = range(100, 2**26)
 """Bounds `episode_events_max`: a sequence has 26 bits (`events.ids.SEQUENCE_MAX`); a plan needs about 100 events."""
+_REMOVED = ("batch_bytes_max", "batch_age_ms", "fold_worker_restart_s")
+_log = logging.getLogger("pycrorm_async")
 _CHOICES = {
     "writer": get_args(Writer),
     "on_full": get_args(OnFull),
@@ -56,9 +59,7 @@ class Settings:
         record_bytes_max: size of the largest event; a larger one is refused.
         episode_events_max: an episode with this many events records no more (`EpisodeFull` is counted in `faults`), but
             for ends, for which an eighth of them is kept, at most 2**20.
-        batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at the limit it reaches first.
-        fold_worker_restart_s: the daemon waits this long before it restarts a fold worker that died; the wait doubles
-            after each further death, up to a minute.
+        batch_events_max: a batch closes at this many events, or earlier at 4 MiB of payloads or at an age of 50 ms.
         idle_ms: a plan that has emitted no event for this long counts as idle, and its events are folded.
         fold: the writer thread folds when the plan idles ("idle"), or only at a flush and at the end of the memory
             ("at_end"): for an executive that sleeps often, because the fold competes with it for the interpreter.
@@ -90,9 +91,6 @@ class Settings:
     record_bytes_max: int = 2**20
     episode_events_max: int = 2**26 - 1
     batch_events_max: int = 10_000
-    batch_bytes_max: int = 4 * 2**20
-    batch_age_ms: int = 50
-    fold_worker_restart_s: float = 1.0
     idle_ms: int = 200
     fold: Fold = "idle"
     recall: bool = True
@@ -104,13 +102,20 @@ class Settings:
     on_unrecordable: OnUnrecordable = "record_missing"
     record_meshes: RecordMeshes = "boxes"
     file_access: FileAccess = "owner"
+    # Removed: accepted without effect for one release, see `_REMOVED`.
+    batch_bytes_max: InitVar[object] = None
+    batch_age_ms: InitVar[object] = None
+    fold_worker_restart_s: InitVar[object] = None
 
     def changed(self) -> dict[str, Any]:
         """Return the settings that differ from their defaults, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value != getattr(Settings, name)}
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, *removed: object) -> None:
+        for name, value in zip(_REMOVED, removed, strict=True):
+            if value is not None:
+                _log.warning("Settings.%s has no effect any more, and the next release refuses it", name)
         for field in fields(self):
             value = getattr(self, field.name)
             violation = _violation(field.name, value)

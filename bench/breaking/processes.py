@@ -516,17 +516,13 @@ def killed_daemons(server: Server | None) -> Callable[[int, random.Random, Path,
 #
 # Kill or stop fold workers of a daemon at random moments while a plan records.
 
-_WORKER_SETTINGS = replace(
-    SETTINGS,
-    fold_worker_restart_s=0.02,
-)
 _REPLACED_S_MAX = 120.0
 
 
 def _serve_with_workers(url: str, spool: str) -> None:
     """Run a daemon with one fold worker, so that the daemon must use the worker that is stopped."""
     leave = asyncio.Event()
-    asyncio.run(serve(url, spool=Path(spool), stop=leave, report=report, settings=_WORKER_SETTINGS, fold_workers=1))
+    asyncio.run(serve(url, spool=Path(spool), stop=leave, report=report, settings=SETTINGS, fold_workers=1))
 
 
 def faulty_workers(

@@ -31,7 +31,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
-from pycrorm_async.writer.drain import BRIEF, retry
+from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
@@ -180,7 +180,7 @@ class _Copier:
             self._batch_events += len(page)
             self._progress(len(page))
             settings = self._settings
-            if self._batch_events >= settings.batch_events_max or self._batch_bytes >= settings.batch_bytes_max:
+            if self._batch_events >= settings.batch_events_max or self._batch_bytes >= BATCH_BYTES_MAX:
                 await self._append()
             if row.id in self._damage or row.id in self._refused:
                 return

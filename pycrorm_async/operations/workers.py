@@ -80,6 +80,8 @@ from pycrorm_async.writer.drain import Backoff, TablesPort
 # and another one takes its place when it is killed. The parent kills only processes that it started and has not reaped,
 # so a reused pid is never hit.
 
+_RESTART_S: Final = 1.0
+"""The first pause before a restart; it doubles after each further death."""
 _RESTART_S_MAX: Final = 60.0
 """The longest pause before a restart."""
 _HEALTHY_S: Final = 60.0
@@ -185,7 +187,7 @@ class FoldWorker:
 
     async def run(self) -> None:
         """Keep a process running from the moment `wanted` is set; cancelling this kills the process."""
-        backoff = Backoff(first_s=self._settings.fold_worker_restart_s, longest_s=_RESTART_S_MAX)
+        backoff = Backoff(first_s=_RESTART_S, longest_s=_RESTART_S_MAX)
         now_s = asyncio.get_running_loop().time
         await self.wanted.wait()
         deaths = 0

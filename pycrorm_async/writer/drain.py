@@ -97,6 +97,10 @@ BRIEF = Backoff(first_s=0.1, longest_s=1.0, attempts_max=5)
 # === drain ====================================================================================================
 
 _log = logging.getLogger("pycrorm_async")
+BATCH_BYTES_MAX: Final = 4 * 2**20
+"""Bounds the payloads of a batch, and with them the memory and the time of one append."""
+_BATCH_AGE_S: Final = 0.05
+"""Bounds the time for which a batch gathers events: a transaction for each event would cost more than the wait."""
 _T = TypeVar("_T")
 Append: TypeAlias = Callable[[Sequence[Record]], Coroutine[Any, Any, Mapping[EpisodeId, str]]]
 """`Log.append`, or a function that calls it."""
@@ -167,12 +171,11 @@ class Drain:
         Raises `LogDamaged`, the error of a damaged source, and `DatabaseUnavailable` after the last attempt. Calls the
         source's `fail` first; reporting the error to the user is up to the caller.
         """
-        settings = self._settings
         try:
             while batch := await self._source.get_batch(
-                events_max=settings.batch_events_max,
-                bytes_max=settings.batch_bytes_max,
-                age_s_max=settings.batch_age_ms / 1000,
+                events_max=self._settings.batch_events_max,
+                bytes_max=BATCH_BYTES_MAX,
+                age_s_max=_BATCH_AGE_S,
             ):
                 refusals = await self._append(batch)
                 await self._acknowledge(await self._safe_position(batch, refusals))

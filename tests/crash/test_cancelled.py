@@ -40,7 +40,7 @@ pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 
 STRIDES = pytest.mark.parametrize("stride", [8, pytest.param(1, marks=pytest.mark.soak)])
 """A run cancels at an eighth of the awaits, chosen by its seed, and the soak at all of them."""
-SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)
+SETTINGS = Settings(batch_events_max=10, idle_ms=1)
 CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}
 """SQLAlchemy and asyncpg leave these tasks to the loop when they are cancelled while they close a connection."""
 TEXTS = ["a", "b", "c", "d", "e"]

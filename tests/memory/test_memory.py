@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -256,6 +256,13 @@ async def test_an_impossible_argument_of_an_episode_is_refused_by_name(
 def test_an_impossible_setting_is_refused_by_name(arguments: dict[str, Any]) -> None:
     with pytest.raises(CallerError, match=rf"Settings\.{next(iter(arguments))} is "):
         Settings(**arguments)
+
+
+def test_a_removed_setting_is_accepted_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    assert replace(Settings(batch_age_ms=10), idle_ms=5) == Settings(idle_ms=5)
+    assert [each.getMessage() for each in caplog.records] == [
+        "Settings.batch_age_ms has no effect any more, and the next release refuses it"
+    ]
 
 
 @pytest.mark.slow

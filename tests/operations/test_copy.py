@@ -50,7 +50,7 @@ pytestmark = pytest.mark.slow
 #
 # A copy holds what its source holds, whatever interrupts it.
 
-SMALL = Settings(batch_events_max=40, batch_bytes_max=8_000)
+SMALL = Settings(batch_events_max=40)
 """Small batches, so that a copy takes many and their boundaries fall within episodes."""
 
 
@@ -332,7 +332,7 @@ async def test_an_impossible_copy_makes_no_target(new_file: New) -> None:
 @pytest.mark.soak_on("postgresql")
 async def test_large_events_are_copied_in_small_batches(new_file: New, monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = new_file(), new_file()
-    big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 5_000)
+    big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 20_000)
     records = [record(episode(1), sequence, payload=big) for sequence in range(1, 601)]
     await append_and_fold(source, [*records, *run_of(episode(2), 1, 30)], folded=False)
     batches: list[int] = []
@@ -344,9 +344,7 @@ async def test_large_events_are_copied_in_small_batches(new_file: New, monkeypat
 
     monkeypatch.setattr(LogAndTables, "append", noted)
     done: list[int] = []
-    await copy_episodes(
-        source, target, settings=Settings(batch_bytes_max=2**20), report_progress=lambda count, *_: done.append(count)
-    )
+    await copy_episodes(source, target, report_progress=lambda count, *_: done.append(count))
     assert logs_of(target) == logs_of(source)
     assert (done, batches) == ([250, 500, 600, 630], [250, 250, 130])
     assert len(tables_of(target)["task_tree_node"]) == 630

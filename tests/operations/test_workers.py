@@ -302,8 +302,13 @@ def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -
 #
 # The daemon runs in this loop; its one worker is a process of its own, which is forked instead of spawned.
 
-PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1)
+PATIENT = Settings(sync_interval_ms=5)
 NOTES = 10
+
+
+@pytest.fixture(autouse=True)
+def quick_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pycrorm_async.operations.workers._RESTART_S", 0.1)
 
 
 @dataclass
