@@ -54,7 +54,7 @@ from pycrorm_async.queue.locks import STORED
 from pycrorm_async.queue.scan import SegmentScanner, last_event
 from pycrorm_async.queue.sources import computed_ends
 from pycrorm_async.queue.spool import Progress, Spool, is_folder_name, parse_folder_name, wrap_os_errors
-from pycrorm_async.queue.stored_segments import EpisodeNumbers, stored_in
+from pycrorm_async.queue.stored_segments import EpisodeNumbers, kept_segments, stored_in
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -72,6 +72,8 @@ _log = logging.getLogger("pycrorm_async")
 
 _HEADS_MAX: Final = 64
 """Bounds the episodes whose confirmed heads a process compares: more than it appends to at once."""
+_RECORDERS_MAX: Final = 256
+"""Bounds the recorders whose kept segments the first comparison reads, those kept last: 256 take some 50 ms."""
 _HEALINGS_MAX: Final = 3
 """Bounds the healings in one append, because a log may go back again while it is healed."""
 
@@ -145,7 +147,11 @@ class LogAndTables:
         async with self._comparing:
             heads = self._heads
             if heads is None:
-                heads = await asyncio.to_thread(stored_heads, self._spool, self.log_id)
+                try:
+                    heads = await asyncio.to_thread(stored_heads, self._spool, self.log_id)
+                except (OSError, FilesError) as error:  # must not stop the drain
+                    _log.warning("%s: cannot compare with the kept segments: %s", self.log.address, error)
+                    heads = {}
             rows = await self.log.heads(list(heads))
             now = {each: rows[each].head if each in rows else 0 for each in heads}
             lost = next((each for each, head in heads.items() if now[each] < head), None)
@@ -371,19 +377,20 @@ def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
 
 
 def stored_heads(spool: Path, log_id: str) -> dict[EpisodeId, int]:
-    """Return heads that the log must have reached, by episode; the last ones last. Raises `FilesError`.
+    """Return heads that the log must have reached, by episode; the last ones last. Raises `FilesError` and `OSError`.
 
     Of each recorder with kept segments that is the last event of these; of a living recorder that another process
     drains, each episode in its folder.
     """
     heads: dict[EpisodeId, int] = {}
-    kept = stored_in(spool, log_id)
-    for folder in sorted(kept.iterdir()) if kept is not None and kept.is_dir() else ():
-        segments = _segments(folder) if is_folder_name(folder.name) else {}
-        if segments:
-            number = max(segments)
-            with suppress(FileNotFoundError, SpoolDamaged), map_segment(segments[number]) as buffer:
-                last = last_event(buffer, salt_of(parse_folder_name(folder.name).recorder, number))
+    newest: dict[Path, Path] = {}  # by folder, the one kept last at the end
+    for each in kept_segments(spool):
+        newest.pop(each.path.parent, None)
+        newest[each.path.parent] = each.path
+    for folder, path in list(newest.items())[-_RECORDERS_MAX:]:
+        if folder.parent == stored_in(spool, log_id) and is_folder_name(folder.name):
+            with suppress(FileNotFoundError, SpoolDamaged), map_segment(path) as buffer:
+                last = last_event(buffer, salt_of(parse_folder_name(folder.name).recorder, int(path.stem)))
                 if last is not None:
                     heads[EpisodeId(last.episode)] = last.sequence
     for recorder in Spool(spool).recorders():

@@ -229,12 +229,13 @@ class EpisodeNumbers:
             _log.warning("numbers of episodes cannot be noted in %s: %s", self._path, error)
 
     def read(self) -> dict[EpisodeId, int]:
-        """Return the numbers that any process has noted. Raises `OSError`, but not for a missing file."""
+        """Return the numbers that any process has noted; none from a file that cannot be read."""
         numbers = {}
         for path in (self._full, self._path):
-            for line in path.read_bytes().splitlines() if path.exists() else ():
-                fields, _, checksum = line.rpartition(b" ")
-                if checksum == b"%08x" % crc32(fields):
-                    episode, number = fields.decode().split()
-                    numbers[parse_episode_id(episode)] = int(number)
+            with suppress(OSError):
+                for line in path.read_bytes().splitlines():
+                    fields, _, checksum = line.rpartition(b" ")
+                    if checksum == b"%08x" % crc32(fields):
+                        episode, number = fields.decode().split()
+                        numbers[parse_episode_id(episode)] = int(number)
         return numbers

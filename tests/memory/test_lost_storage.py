@@ -449,3 +449,13 @@ async def test_records_that_are_no_longer_kept_are_refused_with_their_gap_and_re
     assert "went back" not in caplog.text
     [note_text] = await incarnations(database_url)
     assert "1 of 1 episodes stay incomplete" in note_text
+
+
+async def test_kept_segments_that_cannot_be_read_stop_no_event(spool: Path, caplog: pytest.LogCaptureFixture) -> None:
+    spool.mkdir()
+    (spool / "stored").write_text("not a folder")
+    async with memory_at(f"sqlite:///{spool.parent}/memory.db", spool) as memory:
+        await note(memory, "a")
+        await memory.flush()
+        assert await texts(memory) == ["a"]
+    assert "cannot compare with the kept segments" in caplog.text

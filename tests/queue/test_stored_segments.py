@@ -284,6 +284,7 @@ def test_numbers_that_cannot_be_noted_are_no_error(tmp_path: Path, caplog: pytes
     numbers = EpisodeNumbers(tmp_path / "stored" / "a")
     numbers.note({episode(1): 1})
     assert "numbers of episodes cannot be noted" in caplog.text
+    assert numbers.read() == {}
 
 
 # === stored heads =============================================================================================
