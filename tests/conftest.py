@@ -23,7 +23,7 @@ from tests.commands import fork_child
 from tests.databases import Server, put_memory, server_in_memory
 from tests.long_modules import long_modules_first
 from tests.report.browser import Browser, browser, chromium
-from tests.soak_turns import SLOW_IN_TURNS, current_commit, place_of, turn_of
+from tests.soak_turns import SLOW_AT_EACH_COMMIT, current_commit, place_of, turn_of
 
 # A busy machine must not fail a test by its time; Hypothesis measures its deadline on the wall clock.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -128,7 +128,7 @@ def pytest_pycollect_makeitem(collector: pytest.Module | pytest.Class, obj: obje
     """Make no items of the tests that the marks of this run leave out: each process would only deselect them."""
     own = getattr(obj, "pytestmark", ())
     names = {each.name for each in (*collector.iter_markers(), *(own if isinstance(own, list) else ()))}
-    if "slow" in names and collector.path.parent.name in SLOW_IN_TURNS:
+    if "slow" in names and collector.path.parent.name not in SLOW_AT_EACH_COMMIT:
         names.add("soak")
     return [] if names & _left_out(collector.config) else None
 
@@ -180,7 +180,7 @@ def _select(config: pytest.Config, items: list[pytest.Item]) -> None:
         variants = (
             item.callspec.params.values() if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ()
         )
-        in_turns = item.get_closest_marker("slow") and item.path.parent.name in SLOW_IN_TURNS
+        in_turns = item.get_closest_marker("slow") and item.path.parent.name not in SLOW_AT_EACH_COMMIT
         if in_turns or any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants):
             item.add_marker(pytest.mark.soak)
     commit = config.getoption("--soak-turn")

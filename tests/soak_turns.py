@@ -18,8 +18,8 @@ from typing import Final
 TURNS: Final = 20
 """Twenty turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
-SLOW_IN_TURNS: Final = frozenset({"bench", "cli", "learning", "plan", "query", "report"})
-"""The folders whose slow tests are soak, so that the README's test command stays short."""
+SLOW_AT_EACH_COMMIT: Final = frozenset({"crash", "promises", "pycram"})
+"""The folders whose slow tests run at each commit. Those of the others are soak: the test command stays short."""
 
 
 def turn_of(commit: str) -> int:
