@@ -43,7 +43,7 @@ _READ: Mapping[Any, Callable[[str], Any]] = {
     float: float,
     datetime: parse_since,
 }
-"""Reads an argument of this type; others are texts."""
+"""Functions that read the text of an argument, by its type. An argument of another type stays a text."""
 
 
 def export(

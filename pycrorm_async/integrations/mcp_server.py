@@ -283,7 +283,7 @@ class _Tools:
     # --- the database -----------------------------------------------------------------------------------------
 
     async def _open(self) -> Reading:
-        """Return the reading side, of the file that has the database's name now.
+        """Return the memory opened for reading, opened again if its SQLite file was replaced.
 
         An open connection would go on reading a SQLite file that was deleted or replaced.
         """

@@ -62,7 +62,7 @@ class Seams:
     def around(self, owner: type, name: str, perform: Callable[..., Any]) -> None:
         """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself.
 
-        Arguments that the caller passes by name reach `perform` by position, as far as they have one.
+        An argument that the caller passes by name is passed to `perform` by position, unless it is keyword-only.
         """
         original = vars(owner)[name]
         parameters = signature(original)

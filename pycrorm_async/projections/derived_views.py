@@ -611,7 +611,7 @@ def spatial_relations(tables: TablesByName, picked: FromClause, placed: FromClau
 
 
 def _moments(tables: TablesByName, picked: FromClause, placed: FromClause, *, simulated: bool) -> Subquery:
-    """Return the nodes with their object's identity, and the id that a row of their moment's event would have."""
+    """Return nodes with the identity of their object and the id of a row made from the event at their moment."""
     node, target = tables["task_tree_node"], tables["object"].alias("target")
     first_id = node.c.id.bitwise_rshift(_NUMBER_BITS).bitwise_lshift(_NUMBER_BITS)
     ended = first_id + node.c.end_sequence.bitwise_lshift(_SLOT_BITS)

@@ -431,7 +431,7 @@ class CaseReader:
         return self._sequences[1]
 
     async def forget(self, threshold: float, now_us: int, *, dry_run: bool) -> Forgotten:
-        """Hide the cases whose ways have an activation below the threshold now, and no others, from this reader."""
+        """Hide from this reader the cases of every way whose activation is now below the threshold; show all others."""
         async with self._reading:
             hidden, self._hidden = self._hidden, _NO_NODES
             cases = forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)

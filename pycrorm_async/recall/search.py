@@ -463,7 +463,7 @@ _NO_NODES: Final = np.zeros(0, np.int64)
 
 
 class Forgotten(NamedTuple):
-    """The cases whose ways have an activation below a threshold.
+    """The cases of the ways (a way is what cases with equal values have in common) whose activation is below a threshold.
 
     Attributes:
         cases, ways: their numbers.
@@ -476,7 +476,7 @@ class Forgotten(NamedTuple):
 
 
 def forgotten(library: CaseLibrary, *, threshold: float, now_us: int) -> Forgotten:
-    """Return the cases whose ways have an activation below the threshold. Nothing is deleted."""
+    """Return the cases of the ways whose activation is below the threshold. Nothing is deleted."""
     nodes, count = [], 0
     for name in library.types:
         ways = _ways_of(name, library, now_us)

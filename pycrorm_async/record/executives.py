@@ -102,9 +102,9 @@ class Activations(EpisodeBlock, Generic[B]):
     """Records the ticks of an executive while its `with` block is open, as one episode; RUNNING nodes end INTERRUPTED.
 
     The `result` of a node has its number of `ticks`; the last observation `repeated` of it has the number of further
-    ticks with the same status and feedback. Feedback is the message of a failure, and in the result of a success. If an
-    exception of a behaviour leaves the block, that behaviour and those above it end with it. One thread ticks; no
-    method raises.
+    ticks with the same status and feedback. The feedback of a failed node is its message, that of a node that succeeded
+    is in its `result`. If an exception of a behaviour leaves the block, that behaviour and its ancestors end with the
+    exception. One thread ticks; no method raises.
 
     Args:
         executive, episode: see `EpisodeBlock`.
@@ -240,7 +240,7 @@ class Activations(EpisodeBlock, Generic[B]):
     def _end(
         self, activation: _Activation[B], status: NodeStatus | None, failure: BaseException | str | None = None
     ) -> None:
-        """End an activation, after those below it, which the executive stopped without a visit."""
+        """End an activation. Children that the executive stopped without visiting end first, as INTERRUPTED."""
         for child in [each for each in reversed(self._open.values()) if each.parent is activation]:
             self._end(child, "INTERRUPTED")
         feedback, result = self._feedback(activation.behaviour), dict[str, Any](ticks=activation.ticks)

@@ -140,7 +140,7 @@ class Episode(EpisodeWriter):
         return self.world.reference(world_object) if self.world is not None else None
 
     def node_reference(self, node: TaskTreeNode | None) -> NodeReference:
-        """Return a reference to this node, or to its nearest recorded ancestor; None gives the root."""
+        """Return a reference to this node, or to its nearest recorded ancestor; without a node, to the root."""
         return NodeReference(str(self), self.node_or_root(node))
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
@@ -158,7 +158,7 @@ class Episode(EpisodeWriter):
             self.faults = (*self.faults[1 - UNAWAITED_MAX :], fault)
 
     def node_or_root(self, node: TaskTreeNode | None, /) -> int:
-        """Return the sequence of this node or of its nearest recorded ancestor; None gives the root."""
+        """Return the sequence of this node or of its nearest recorded ancestor; without a node, that of the root."""
         while node is not None:
             record: NodeRecord | None = node.record
             if record is not None and record.episode is self:

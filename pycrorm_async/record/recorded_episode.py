@@ -397,7 +397,7 @@ class RecordedEpisode(EpisodeWriter):
         return NodeReference(str(self), self.node_or_root(self._find(key, "EpisodeStarted")))
 
     def node_or_root(self, node: Any) -> int:
-        """Return the sequence of this node, or of the nearest above it that is in this episode; None gives the root."""
+        """Return the sequence of this node or of its nearest ancestor in this episode; without a node, of the root."""
         while isinstance(node, _Node):
             if node.episode is self:
                 return node.sequence

@@ -150,7 +150,11 @@ class Connection(aiosqlite.Connection):
             await super().rollback()
 
     def _is_in_transaction(self) -> bool:
-        """Return False if a visit would change nothing: SQLAlchemy rolls back each connection that it gets back."""
+        """Return whether the connection has an open transaction.
+
+        SQLAlchemy asks for a rollback on every return to the pool. Without a transaction the call to the connection's
+        thread is saved.
+        """
         self._begins = False
         return not self._is_idle or self._conn.in_transaction
 

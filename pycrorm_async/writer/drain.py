@@ -111,7 +111,7 @@ class DrainState(NamedTuple):
 
     Attributes:
         source: the recorder's name.
-        records: number of appended records, with those stored before, without refused ones.
+        records: number of appended records. Records that the log already had count too, refused ones do not.
         batches: number of appended batches.
         retries: number of attempts at which the database was unavailable.
         unavailable: the reason why the database is unavailable at the moment; None if it is available.
