@@ -463,7 +463,7 @@ _NO_NODES: Final = np.zeros(0, np.int64)
 
 
 class Forgotten(NamedTuple):
-    """The cases of the ways (a way is what cases with equal values have in common) whose activation is below a threshold.
+    """The cases of each way whose activation is below a threshold. Cases with equal values have a way in common.
 
     Attributes:
         cases, ways: their numbers.
