@@ -46,17 +46,6 @@ _FILE_MEGABYTES = 100
 """The size in MiB above which the next episode begins a new file, the default of LeRobot."""
 _VECTORS = ("observation.state", "action")
 _PICTURE = "observation.images.scene"
-_NUMBERS = {
-    "timestamp": "float32",
-    "time_s": "float64",
-    "event": "int64",
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",
-    "task_index": "int64",
-    "subtask_index": "int64",
-}
-"""The columns of one number; the first and those from `frame_index` to `task_index` are LeRobot's own."""
 
 
 async def write_lerobot(job: Job, folder: Path) -> Written:
@@ -111,6 +100,7 @@ class LeRobotFolder:
         self._file = 0
         self._file_bytes = 0
         self._picture_shape: tuple[int, ...] = ()
+        self._dtypes: dict[str, str] = {}
         self._writer: Any = None
 
     def add(self, episode: ExportedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
@@ -122,6 +112,7 @@ class LeRobotFolder:
         number, count = len(self._episodes), len(frames.at)
         task = episode.started.description or f"episode {episode.number}"
         columns = self._columns(frames, number, task)
+        self._dtypes = {name: str(values.dtype) for name, values in columns.items()}
         statistics = {name: statistics_of(values) for name, values in columns.items()}
         if pictures is not None:
             self._picture_shape = pictures.shape[1:]
@@ -255,7 +246,8 @@ class LeRobotFolder:
     def _info(self, frames: Frames) -> dict[str, Any]:
         vector = {"dtype": "float32", "shape": [len(frames.channels)], "names": list(frames.channels)}
         features: dict[str, Any] = dict.fromkeys(_VECTORS, vector)
-        features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _NUMBERS.items()}
+        for name, dtype in self._dtypes.items():
+            features.setdefault(name, {"dtype": dtype, "shape": [1], "names": None})
         if self._picture_shape:
             names = ["height", "width", "channels"]
             features[_PICTURE] = {"dtype": "image", "shape": list(self._picture_shape), "names": names}

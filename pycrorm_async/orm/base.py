@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from enum import Enum
-from typing import Any, ClassVar, Final, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, dataclass_transform
 
 import msgspec
 from sqlalchemy import (
@@ -360,27 +360,29 @@ class AttributeOnRequest(InstrumentedAttribute[Any]):
         return super().__get__(instance, owner)
 
 
-def _reader(name: str) -> Callable[[Any], Any]:
-    def value(row: Base) -> Any:
-        require_loaded(row, f"_{name}")
-        return getattr(row, f"_{name}")
+class HybridOf(hybrid_property[_Value]):
+    """A private attribute under its public name, which a subclass may map a field of its own under.
 
-    return value
+    If it is loaded `on_request` only, reading it raises `CallerError` as `AttributeOnRequest` does.
+    """
 
+    def __init__(self, name: str, *, on_request: bool = False) -> None:
+        def read(row: Any) -> Any:
+            if on_request:
+                require_loaded(row, f"_{name}")
+            return getattr(row, f"_{name}")
 
-class HybridOnRequest(hybrid_property[_Value]):
-    """A descriptor like `AttributeOnRequest`, for a class whose subclasses may have a field of this name."""
+        super().__init__(read, expr=lambda class_: getattr(class_, f"_{name}"))
+        self.__name__ = name
 
-    def __init__(self, read: Callable[[Any], _Value]) -> None:
-        name = read.__name__
-        super().__init__(_reader(name), expr=lambda class_: getattr(class_, f"_{name}"))
-        self.__name__, self.__doc__ = name, read.__doc__
+    if not TYPE_CHECKING:  # which takes the types from SQLAlchemy's own
 
-    def __get__(self, instance: Any, owner: Any) -> Any:
-        attribute = super().__get__(instance, owner)
-        if instance is None:  # `undefer` asks an attribute for its columns, which SQLAlchemy 2.1 cannot answer here
-            attribute._column_strategy_attrs = lambda: [getattr(owner, f"_{self.__name__}")]  # noqa: SLF001
-        return attribute
+        def __get__(self, instance: Any, owner: Any) -> Any:
+            attribute = super().__get__(instance, owner)
+            # `undefer` asks an attribute for its columns, which SQLAlchemy 2.1 cannot answer here.
+            if instance is None:
+                attribute._column_strategy_attrs = lambda: [getattr(owner, f"_{self.__name__}")]  # noqa: SLF001
+            return attribute
 
 
 # === batch loads ==============================================================================================

@@ -50,7 +50,7 @@ from pycrorm_async.orm.base import (
     EPISODE,
     ON_REQUEST,
     Base,
-    HybridOnRequest,
+    HybridOf,
     JsonText,
     RowOfEvent,
     inherited_from,
@@ -491,61 +491,21 @@ class Designator(RowOfEvent, Base):
     _node: Mapped[TaskTreeNode] = one_of(lambda: Designator.id, "task_tree_node")
 
     # Hybrids, because a subclass may map a field of such a name, which a column of the same name would collide with.
-
-    @hybrid_property
-    def status(self) -> TaskStatus:
-        """The status of its node."""
-        return self._status
-
-    @hybrid_property
-    def start_time(self) -> datetime:
-        """The start of its node."""
-        return self._start_time
-
-    @hybrid_property
-    def end_time(self) -> datetime | None:
-        """The start of its node and the duration; None while it runs, and if it is LOST."""
-        return self._end_time
-
-    @hybrid_property
-    def duration_s(self) -> float | None:
-        """The duration of its node in s; None while it runs, and if it is LOST."""
-        return self._duration_s
-
-    @hybrid_property
-    def duration(self) -> float | None:
-        """The former name of `duration_s`."""
-        return self._duration
-
-    @hybrid_property
-    def reason(self) -> str | None:
-        """The class of the failure that its node ended with."""
-        return self._reason
-
-    @hybrid_property
-    def end_sequence(self) -> int | None:
-        """The event of its node's end; None while it runs, and if it is LOST."""
-        return self._end_sequence
-
-    @hybrid_property
-    def robot(self) -> str | None:
-        """The name of the robot that acted; None without one."""
-        return self._robot
+    status = HybridOf[TaskStatus]("status")
+    start_time = HybridOf[datetime]("start_time")
+    end_time = HybridOf[datetime | None]("end_time")
+    duration_s = HybridOf[float | None]("duration_s")
+    duration = HybridOf[float | None]("duration")
+    reason = HybridOf[str | None]("reason")
+    end_sequence = HybridOf[int | None]("end_sequence")
+    robot = HybridOf[str | None]("robot")
+    parameters = HybridOf[dict[str, Any]]("parameters", on_request=True)
+    node = HybridOf["TaskTreeNode"]("node", on_request=True)
 
     @hybrid_property
     def episode(self) -> ProcessMetaData:
         """The episode that it belongs to."""
         return self.process_metadata
-
-    @HybridOnRequest
-    def parameters(self) -> dict[str, Any]:
-        """Its fields as recorded. Raises `CallerError` if they are not loaded."""
-        return self._parameters
-
-    @HybridOnRequest
-    def node(self) -> TaskTreeNode:
-        """Its node of the task tree. Raises `CallerError` if it is not loaded."""
-        return self._node
 
     @classmethod
     def is_a(cls, concept: str) -> ColumnElement[bool]:

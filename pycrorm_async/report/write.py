@@ -91,6 +91,7 @@ async def report(
     force: bool = False,
     first: int | None = None,
     last: int | None = None,
+    similar: SimilarCases | None = None,
 ) -> Report:
     """Write an episode as one HTML file that opens offline, and return the file and the events that it shows.
 
@@ -101,31 +102,20 @@ async def report(
         force: replace the file if it exists.
         first, last: sequences of the first and the last event to show; all by default, up to 100,000 nodes
             or 200,000 moves.
+        similar: the cases of the memory, which an overview reads once for all its pages.
 
     Raises `UnknownEpisode`; `CallerError` if the file exists or cannot have this name, or if no event is in the window;
     `LogDamaged` or `DatabaseForeign` for an event that cannot be read; `OSError` if the disk is full.
     """
-    return await _report(SimilarCases(reading), reading, episode, path, force=force, first=first, last=last)
-
-
-async def _report(
-    similar: SimilarCases,
-    reading: Reading,
-    episode: AnyEpisode,
-    path: str | PathLike[str] | None,
-    *,
-    force: bool,
-    first: int | None = None,
-    last: int | None = None,
-) -> Report:
     if path is not None:
         refuse_existing(Path(path), force=force)
     name = str(episode.number if isinstance(episode, EpisodeSummary) else episode)
     document = await episode_document(reading, name, first=first, last=last)
     document["outcomes"] = await outcomes_of(reading, document["episode"]["number"])
+    similar = similar or SimilarCases(reading)
     document["similar"] = await similar.document(document["episode"]["number"], document["nodes"][0])
     file = Path(path) if path is not None else Path(page_name(document["episode"]["number"]))
-    await asyncio.to_thread(lambda: write_page(page_of(document), file, force=force))
+    await asyncio.to_thread(lambda: write_file(page_of(document).encode(), file, force=force))
     shown = document["episode"]
     return Report(file, shown["first"], shown["last"], shown["head"])
 
@@ -165,7 +155,7 @@ async def overview(
         pages = {each.number: f"{quote(folder.name)}/{page_name(each.number)}" for each in shown}
         document = await overview_document(reading, title, episodes, total, pages, unreadable)
         document["successes"] = successes
-        await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
+        await asyncio.to_thread(lambda: write_file(overview_page_of(document).encode(), file, force=force))
     return Overview(file, len(episodes), len(pages), total - len(episodes), unreadable)
 
 
@@ -190,7 +180,7 @@ async def _write_pages(
     similar = SimilarCases(reading, [each.number for each in episodes])
     for each in episodes:
         try:
-            await _report(similar, reading, each, folder / page_name(each.number), force=force)
+            await report(reading, each, folder / page_name(each.number), force=force, similar=similar)
         except (LogDamaged, DatabaseForeign) as error:
             unreadable[each.number] = str(error)
         except (PycrormError, OSError):
@@ -264,11 +254,6 @@ def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scr
         "scripts": "\n".join(f"<script>{each}</script>" for each in scripts),
     }
     return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
-
-
-def write_page(page: str, path: Path, *, force: bool = False) -> None:
-    """Write a page to a file that is complete as soon as it has its name. Raises `CallerError`, `OSError`."""
-    write_file(page.encode(), path, force=force)
 
 
 def _safe_json(document: Mapping[str, Any]) -> str:
