@@ -11,15 +11,15 @@ import shutil
 import signal
 import sqlite3
 import tempfile
-import threading
 import time
 import uuid
 import warnings
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, closing, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 import asyncpg
@@ -42,6 +42,7 @@ __all__ = [
     "run_in_own_loop",
 ]
 
+_T = TypeVar("_T")
 _ROOM_BYTES: Final = 4 << 30
 """A server takes at most half a gigabyte, and each test process starts one or two."""
 _RENAME_LOG: Final = ("SET session_replication_role = replica", "UPDATE pycrorm_log SET id = gen_random_uuid()")
@@ -101,7 +102,7 @@ class Server:
     def drop(self, url: str) -> None:
         """Drop the database of that URL, although programs are connected to it."""
         name = urlsplit(url).path.removeprefix("/")
-        run_in_own_loop(_run(self.url(), f"DROP DATABASE IF EXISTS {name} WITH (FORCE)", ()))
+        change_each(self.url(), [f"DROP DATABASE IF EXISTS {name} WITH (FORCE)"])
 
     def drop_soon(self, url: str) -> None:
         """Drop the database of that URL in the same way, together with some others, or when the server ends."""
@@ -180,9 +181,7 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
     if not syncs:
         # Plans must not depend on whether autovacuum has analysed a table meanwhile.
         settings = ("fsync = off", "full_page_writes = off", "autovacuum = off", "max_wal_size = '128MB'")
-        for change in (f"SET {each}" for each in settings):
-            run_in_own_loop(_run(running.url(), f"ALTER SYSTEM {change}", ()))
-        run_in_own_loop(_run(running.url(), "SELECT pg_reload_conf()", ()))
+        change_each(running.url(), [*(f"ALTER SYSTEM SET {each}" for each in settings), "SELECT pg_reload_conf()"])
     try:
         yield running
     finally:
@@ -210,20 +209,34 @@ def server_in_memory() -> Iterator[Server]:
 
 def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:
     """Return the rows of a plain query on a new connection. `place` is a URL, or the path of a SQLite file."""
-    url = str(place)
-    if not url.startswith("postgresql:"):
-        with closing(sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)) as connection:
-            return connection.execute(statement, tuple(parameters)).fetchall()
-    return [tuple(row) for row in run_in_own_loop(_run(url, statement, tuple(parameters)))]
+    [rows] = _each(place, [(statement, tuple(parameters))])
+    return rows
 
 
 def ask_each(place: str | Path, statements: Iterable[str]) -> list[list[Any]]:
     """Return the rows of each query, all on one new connection. One of SQLite first parses the schema for 4 ms."""
+    return _each(place, [(each, ()) for each in statements])
+
+
+def ask_to_change(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> None:
+    """Execute a change in the same way, and commit it."""
+    _each(place, [(statement, tuple(parameters))], commit=True)
+
+
+def change_each(place: str | Path, statements: Iterable[str]) -> None:
+    """Execute and commit each of the changes, all on one new connection."""
+    _each(place, [(each, ()) for each in statements], commit=True)
+
+
+def _each(place: str | Path, queries: list[tuple[str, tuple[Any, ...]]], *, commit: bool = False) -> list[list[Any]]:
     url = str(place)
-    if not url.startswith("postgresql:"):
-        with closing(sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)) as connection:
-            return [connection.execute(each).fetchall() for each in statements]
-    return run_in_own_loop(_run_each(url, statements))
+    if url.startswith("postgresql:"):
+        return run_in_own_loop(_fetch_each(url, queries))
+    with closing(sqlite3.connect(url.removeprefix("sqlite:///"), timeout=5.0 if commit else 0.1)) as connection:
+        rows = [connection.execute(*each).fetchall() for each in queries]
+        if commit:
+            connection.commit()
+        return rows
 
 
 @asynccontextmanager
@@ -255,29 +268,6 @@ def await_events(file: Path, count: int) -> None:
     raise TimeoutError(f"there are no {count} events in {file}")
 
 
-def ask_to_change(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> None:
-    """Execute a change in the same way, and commit it."""
-    url = str(place)
-    if url.startswith("postgresql:"):
-        ask(url, statement, parameters)
-        return
-    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as connection:
-        connection.execute(statement, tuple(parameters))
-        connection.commit()
-
-
-def change_each(place: str | Path, statements: Iterable[str]) -> None:
-    """Execute and commit each of the changes, all on one new connection."""
-    url = str(place)
-    if url.startswith("postgresql:"):
-        run_in_own_loop(_run_each(url, statements))
-        return
-    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as connection:
-        for each in statements:
-            connection.execute(each)
-        connection.commit()
-
-
 async def _make_memory(url: str) -> None:
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:
@@ -295,31 +285,12 @@ async def _connection(url: str) -> AsyncIterator[Any]:
         await connection.close()
 
 
-async def _run(url: str, statement: str, parameters: tuple[Any, ...]) -> list[Any]:
+async def _fetch_each(url: str, queries: Iterable[tuple[str, tuple[Any, ...]]]) -> list[list[Any]]:
     async with _connection(url) as connection:
-        return list(await connection.fetch(statement, *parameters))
+        return [[tuple(row) for row in await connection.fetch(each, *parameters)] for each, parameters in queries]
 
 
-async def _run_each(url: str, statements: Iterable[str]) -> list[list[Any]]:
-    async with _connection(url) as connection:
-        return [[tuple(row) for row in await connection.fetch(each)] for each in statements]
-
-
-def run_in_own_loop(call: Coroutine[Any, Any, list[Any] | None]) -> list[Any]:
-    """Run it in a thread with a loop of its own, and return its rows; a loop may run in this thread."""
-    answer: list[Any] = []
-    fault: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            rows: list[Any] | None = asyncio.run(call)
-            answer.extend(rows or [])
-        except BaseException as error:  # noqa: BLE001  raised again in the thread that asked
-            fault.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    if fault:
-        raise fault[0]
-    return answer
+def run_in_own_loop(call: Coroutine[Any, Any, _T]) -> _T:
+    """Run it in a thread with a loop of its own, and return its result; a loop may run in this thread."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(asyncio.run, call).result()
