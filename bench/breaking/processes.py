@@ -33,7 +33,7 @@ from bench.breaking.files import ROOMY, events_of, put
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async import Memory
 from pycrorm_async.errors import SpoolClosed, SpoolFull
-from pycrorm_async.events.codec import LOST
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.recovery import recover as recover_spool
@@ -47,7 +47,8 @@ from tests.crash import recorder_process
 from tests.crash.step_robot import SETTINGS, StepActionPerformable, report
 from tests.databases import Server, ask
 from tests.queue.factories import SMALL, episode, make, node, recover
-from tests.store.test_crash import PER_BATCH, append_all, batch
+from tests.store.factories import episode as store_episode
+from tests.store.factories import run_of
 
 # === child process ============================================================================================
 #
@@ -234,31 +235,46 @@ _STORED = (
 )
 
 
+_PER_BATCH = 300
+
+
+def _batch(number: int) -> list[Record]:
+    first = number * _PER_BATCH + 1
+    return [each for of in (1, 2) for each in run_of(store_episode(of), first, first + _PER_BATCH - 1)]
+
+
+async def _append_all(url: str, first: int) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    for number in count(first):
+        assert await log.append(_batch(number)) == {}
+        recorder_process.report("appended", number)
+
+
 def _append(url: str, first: int) -> None:
-    asyncio.run(append_all(DatabaseAddress.parse(url), count(first)))
+    asyncio.run(_append_all(url, first))
 
 
 def killed_appenders(new_database: Callable[[Path], str]) -> Callable[[int, random.Random, Path, Step], Outcome]:
     """Kill a process that appends batches to a database; the next one starts at the last batch that is stored."""
 
     def killed(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-        outcome, url = Outcome(note=f"batches of {2 * PER_BATCH} events of two episodes"), new_database(folder)
+        outcome, url = Outcome(note=f"batches of {2 * _PER_BATCH} events of two episodes"), new_database(folder)
         stored = appended = 0
         for _ in range(rounds):
             lines = _lines_until_killed(_append, (url, max(stored - 1, 0)), rng.random() * _LONGEST_LIFE_S)
             appended = max([stored, *(int(line[1]) + 1 for line in lines if line[0] == "appended")])
             heads = _wait_for_heads(url) or [0, 0]
-            outcome.lost += sum(max(0, appended * PER_BATCH - head) for head in heads)
-            outcome.misordered += sum(head % PER_BATCH != 0 for head in heads)  # a batch is stored in part
-            stored = heads[0] // PER_BATCH
+            outcome.lost += sum(max(0, appended * _PER_BATCH - head) for head in heads)
+            outcome.misordered += sum(head % _PER_BATCH != 0 for head in heads)  # a batch is stored in part
+            stored = heads[0] // _PER_BATCH
             step()
         events = [
             (episode_text(each.episode), each.sequence, each.payload.decode())
             for number in range(stored)
-            for each in batch(number)
+            for each in _batch(number)
             if each.episode is not None
         ]
-        outcome.compare(events[: 2 * PER_BATCH * appended], ask(url, _STORED), put=events)
+        outcome.compare(events[: 2 * _PER_BATCH * appended], ask(url, _STORED), put=events)
         outcome.rounds = rounds
         return outcome
 

@@ -3,7 +3,7 @@
 `python -m bench.faults` runs more and longer rounds, some on disks of their own.
 
  1  SIGKILL at any moment
-        test_killed (24 kills, 10,000 in the soak), test_daemon, test_many_machines, store/test_crash
+        test_killed (24 kills, 10,000 in the soak), test_daemon, test_many_machines; a process that appends: the bench
  2  killed at each step that touches disk or log, and once more
         test_crash_points; queue/test_dead_source (sealing, removing), queue/test_maintenance
  3  power cut: any sectors of what was not synced
@@ -20,7 +20,7 @@
  7b each system call of queue, writer and SQLite fails once
         test_failing_calls
  8  a full disk, below the queue and below the database
-        test_disk, store/test_crash, cli/test_bad_spool
+        test_disk, store/test_full_disk, cli/test_bad_spool
  9  a COMMIT whose reply is lost
         store/test_postgresql_faults, writer/test_drain, writer/test_writer_thread
 10  a database stopped or killed under load, a network that cuts, stalls, resets, dribbles
@@ -33,8 +33,7 @@
         test_daemon, test_cancelled, projections/test_projector (parked once, visible once),
         memory/test_delegated_writer
 14  cancelled at every await, fork, exit with a full queue, a requested stop
-        test_cancelled, store/test_crash, store/test_postgresql_faults, queue/test_locks_and_forks,
-        test_killed, test_daemon
+        test_cancelled, queue/test_locks_and_forks, test_killed, test_daemon
 15  a plan faster than its writer, clocks set back
         queue/test_full_spool, memory/test_delegated_writer (a full spool), test_killed
 

@@ -1,9 +1,10 @@
-"""Blobs on both kinds of database: stored before the events that refer to them, in parts, once, and never changed."""
+"""Blobs: stored before the events that refer to them, in parts, once, and never changed."""
 
 from __future__ import annotations
 
 import os
 from hashlib import sha256
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import msgspec
@@ -24,6 +25,12 @@ from tests.store.factories import episode, record
 
 CONTENT = os.urandom(50)
 NAME = sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def database_url(tmp_path: Path) -> str:
+    """Use SQLite alone: the SQL is the same, and roles on PostgreSQL have a test of their own."""
+    return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
 class Files:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -23,8 +23,8 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from pycrorm_async.writer.drain import Backoff, Drain
-from tests.databases import Server, ask, ask_each, server_in_memory
-from tests.store.factories import cancel_at_await, declaration, episode, run_of
+from tests.databases import Server, ask, ask_each
+from tests.store.factories import declaration, episode, run_of
 from tests.writer.fakes import KeptSource
 
 pytestmark = pytest.mark.slow
@@ -241,37 +241,6 @@ async def test_the_server_probes_a_machine_that_goes_silent_in_the_middle_of_a_s
 # --- the server itself ------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def own_server() -> Iterator[Server]:
-    """A server that the tests kill."""
-    with server_in_memory() as running:
-        yield running
-
-
-@pytest.mark.soak
-async def test_a_server_killed_repeatedly_under_load_stores_everything_once_in_the_end(own_server: Server) -> None:
-    url = own_server.new_database()
-    records = records_of_three_episodes(random.Random(14), 20_000)
-    rng = random.Random(15)
-
-    async def killing(drain: Drain) -> None:
-        for round_ in range(1, 5):
-            enough = round_ * 4000
-            await until(lambda: drain.state.appended >= enough)  # noqa: B023  awaited at once
-            await asyncio.sleep(rng.uniform(0, 0.02))
-            await asyncio.to_thread(own_server.kill)
-            await until(lambda: drain.state.unavailable is not None or drain.state.appended == len(records))
-            acknowledged = drain.state.acknowledged
-            await asyncio.to_thread(own_server.start)
-            # A batch that was acknowledged before the kill is in the database after the restart.
-            [[count]] = await asyncio.to_thread(ask, url, "SELECT count(*) FROM event")
-            assert count >= sum(each.episode is not None for each in records[:acknowledged])
-
-    drain, source = await drained(DatabaseAddress.parse(url), records, killing)
-    assert drain.state.retries >= 3
-    verify_stored_once(url, records, drain, source)
-
-
 @pytest.mark.parametrize("what", ["pg_terminate_backend", "pg_cancel_backend"])
 async def test_an_administrator_who_ends_sessions_or_statements_costs_no_event(what: str, direct_url: str) -> None:
     records = records_of_three_episodes(random.Random(16), 6000)
@@ -287,29 +256,3 @@ async def test_an_administrator_who_ends_sessions_or_statements_costs_no_event(w
 
     drain, source = await drained(DatabaseAddress.parse(direct_url), records, ending)
     verify_stored_once(direct_url, records, drain, source)
-
-
-async def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no_lock(
-    direct_url: str,
-) -> None:
-    stored_events = at = 0
-    address = DatabaseAddress.parse(direct_url)
-    while True:
-        at += 1
-        log = await EventLog.open(address, create=True, busy_timeout_s=2.0)
-        appending = asyncio.create_task(log.append(run_of(episode(1), stored_events + 1, stored_events + 30)))
-        await cancel_at_await(appending, at)
-        [[(head,)], counts] = ask_each(direct_url, (HEAD, "SELECT count(*) FROM event"))
-        assert head in (stored_events, stored_events + 30)
-        assert counts == [(head,)]
-        stored_events = head
-        second = await EventLog.open(address, create=True, busy_timeout_s=2.0)
-        assert (
-            await second.append(run_of(episode(1), stored_events + 1, stored_events + 1)) == {}
-        )  # no session locks its row
-        stored_events += 1
-        await second.close()
-        await log.close()
-        if not appending.cancelled():
-            break
-    assert at > 10
