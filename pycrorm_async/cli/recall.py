@@ -16,7 +16,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase
-from pycrorm_async.recall.recall import EpisodeNames, Recall
+from pycrorm_async.recall.recall import Recall, check_robot
 from pycrorm_async.recall.search import closest
 
 _TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
@@ -93,7 +93,7 @@ def recall(
                 parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
             )
         if robot is not None and ("robot", robot) in answer.never_seen:
-            await EpisodeNames(reading).check_robot(robot)
+            await check_robot(reading, robot)
         return answer, await memory.types(), await answer.outcomes()
 
     answer, types, outcomes = place.read(query)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -243,13 +242,18 @@ async def run(
         WorkerLost: a worker process died; its finished rollouts are recorded.
         InternalError: the memory and the workers' counts differ.
     """
-    async with _open_runner(experiment, place, report_progress) as runner:
+    import pandas as pd
+
+    # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
+    await recover(place.url, spool=place.spool)
+    async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
+        runner = _PhaseRunner(experiment, place, workers, reading, report_progress)
         policy, frames = default_policy(), []
         for number in range(experiment.rounds):
             name = "default policy" if number == 0 else f"learned policy, round {number + 1}"
             frame = await runner.phase(name, policy, experiment.seed + number, experiment.rollouts)
             frames.append(recorded_rollouts.successes(frame))
-            policy = _learn_from(frames, experiment)
+            policy = learn(pd.concat(frames), min_samples_leaf=experiment.min_samples_leaf)
             await runner.record(policy, rounds=number + 1, successes=sum(map(len, frames)))
         await runner.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
@@ -262,26 +266,11 @@ async def run(
         )
 
 
-@asynccontextmanager
-async def _open_runner(
-    experiment: Experiment, place: MemoryLocation, report_progress: ReportProgress
-) -> AsyncIterator[_PhaseRunner]:
-    # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
-    await recover(place.url, spool=place.spool)
-    async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
-        yield _PhaseRunner(experiment, place, workers, reading, report_progress)
-
-
-def _learn_from(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:
-    import pandas as pd
-
-    return learn(pd.concat(frames), min_samples_leaf=experiment.min_samples_leaf)
-
-
 async def read_rollouts(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:
     """Return the recorded rollouts with an index below `count`, each index once."""
     question = recorded_rollouts.rollouts_question(scene=str(scene), seed=seed, policy=policy)
-    frame = recorded_rollouts.drop_repeats(await reading.dataframe(question))
+    # Rollouts with the same seed and index are identical, so any of them will do.
+    frame = (await reading.dataframe(question)).drop_duplicates("index")
     return frame[frame["index"] < count]
 
 

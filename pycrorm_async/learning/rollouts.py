@@ -132,7 +132,8 @@ def rectangles(cells: NDArray[np.bool_]) -> Iterator[Rectangle]:
     for row in range(len(cells) + 1):
         runs = set(_runs(cells[row])) if row < len(cells) else set()
         for run in [each for each in open_runs if each not in runs]:
-            yield _rectangle(open_runs.pop(run), row, run)
+            edges = (open_runs.pop(run), row, *run)
+            yield Rectangle(*(each * _RESOLUTION_M - REACH_M for each in edges))
         for run in runs:
             open_runs.setdefault(run, row)
 
@@ -141,10 +142,6 @@ def _runs(cells: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """Yield the start and the end (exclusive) of each run of true cells."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], cells, [False]])))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-
-
-def _rectangle(first_row: int, end_row: int, run: tuple[int, int]) -> Rectangle:
-    return Rectangle(*(each * _RESOLUTION_M - REACH_M for each in (first_row, end_row, *run)))
 
 
 # === move and pick up =========================================================================================
@@ -548,11 +545,6 @@ def episodes_question(*, scene: str, seeds: Sequence[int], policies: Sequence[st
         .group_by(episode.id, episode.uuid)
         .order_by(episode.id)
     )
-
-
-def drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
-    """Keep one row per index. Rollouts with the same seed and index are identical, so any of them will do."""
-    return frame.drop_duplicates("index")
 
 
 def successes(frame: pd.DataFrame, *, among: int | None = None) -> pd.DataFrame:

@@ -164,7 +164,7 @@ class Recall:
         )
         library = await self._reader.library(dtype_of(type), aliases_of(type))
         words = symbols_of(has), numbers_of(near), symbols_of(lacks)
-        cue = await make_cue(library, EpisodeNames(self._reading), dtype_of(type), *words, conditions)
+        cue = await make_cue(library, self._reading, dtype_of(type), *words, conditions)
         return self._answer(cue, library)
 
     async def like(self, case: AnyCase, *, k: int = 20, simulated: bool = False) -> Answer:
@@ -206,7 +206,7 @@ class Recall:
         symbols = {name: each for name, each in symbols.items() if name in features and name != "object_name"}
         wanted = {name: each for name, each in numbers.items() if name in features}
         words = symbols_of({**symbols, **has}), numbers_of({**wanted, **near})
-        cue = await make_cue(library, EpisodeNames(self._reading), dtype, *words, (), Conditions(k=k, **conditions))
+        cue = await make_cue(library, self._reading, dtype, *words, (), Conditions(k=k, **conditions))
         return self._answer(cue, library)
 
     def _answer(self, cue: Cue, library: CaseLibrary) -> Answer:
@@ -496,39 +496,17 @@ class Conditions(NamedTuple):
     minimum: float = 0.0
 
 
-class EpisodeNames:
-    """The episodes of a memory by name and by tag, and the robots that took part in them."""
-
-    def __init__(self, reading: Reading) -> None:
-        self._reading = reading
-
-    async def numbers_of(self, episode: AnyEpisode | Iterable[AnyEpisode]) -> frozenset[int]:
-        """Return the numbers of one episode or several. Raises `UnknownEpisode`."""
-        several = [episode] if isinstance(episode, int | str | EpisodeSummary) or not _is_iterable(episode) else episode
-        log = await self._reading.log()
-        names = [str(each.number if isinstance(each, EpisodeSummary) else each) for each in several]  # type: ignore[union-attr]
-        return frozenset([(await episode_named(log, name)).number for name in names])
-
-    async def tagged(self, tag: str) -> frozenset[int]:
-        """Return the numbers of the episodes with a tag. Raises `CallerError` if no episode has it."""
-        async with self._reading.session(simulated=True) as session:
-            rows = (await session.execute(select(EpisodeTag.process_metadata_id, EpisodeTag.tag))).all()
-        numbers = frozenset(number for number, each in rows if each == tag)
-        if not numbers:
-            raise CallerError(f"no episode has the tag {tag!r}{closest(tag, {each for _, each in rows})}")
-        return numbers
-
-    async def check_robot(self, robot: str) -> None:
-        """Raise `CallerError` if no robot of this name took part in any episode."""
-        async with self._reading.session(simulated=True) as session:
-            names = set((await session.scalars(select(EpisodeRobot.name).distinct())).all())
-        if robot not in names:
-            raise CallerError(f"no episode has the robot {robot!r}{closest(robot, names)}")
+async def check_robot(reading: Reading, robot: str) -> None:
+    """Raise `CallerError` if no robot of this name took part in any episode."""
+    async with reading.session(simulated=True) as session:
+        names = set((await session.scalars(select(EpisodeRobot.name).distinct())).all())
+    if robot not in names:
+        raise CallerError(f"no episode has the robot {robot!r}{closest(robot, names)}")
 
 
 async def make_cue(
     library: CaseLibrary,
-    episodes: EpisodeNames,
+    reading: Reading,
     dtype: str | None,
     has: tuple[tuple[str, str], ...],
     near: tuple[Wanted, ...],
@@ -536,7 +514,7 @@ async def make_cue(
     conditions: Conditions,
 ) -> Cue:
     """Return the cue. Raises `CallerError` for a moment without a zone or an unknown node, `UnknownEpisode`."""
-    numbers = await _numbers(episodes, conditions)
+    numbers = await _episodes(reading, conditions)
     during = None
     if isinstance(conditions.during, tuple) and not isinstance(conditions.during, Case):
         if len(conditions.during) != 2:
@@ -628,16 +606,26 @@ def _nodes(cases: object) -> frozenset[int]:
     return frozenset(map(node_of, cases))
 
 
-async def _numbers(episodes: EpisodeNames, conditions: Conditions) -> frozenset[int] | None:
-    numbers = None if conditions.episode is None else await episodes.numbers_of(conditions.episode)
-    if conditions.tag is None:
+async def _episodes(reading: Reading, conditions: Conditions) -> frozenset[int] | None:
+    """Return the numbers of the episodes with these names and this tag; None if neither is given.
+
+    Raises `UnknownEpisode`, and `CallerError` if no episode has the tag.
+    """
+    numbers, episode, tag = None, conditions.episode, conditions.tag
+    if episode is not None:
+        is_one = isinstance(episode, EpisodeSummary) or not isinstance(episode, list | tuple | set | frozenset)
+        several: Iterable[AnyEpisode] = [episode] if is_one else episode  # type: ignore[list-item,assignment]
+        names = [str(each.number if isinstance(each, EpisodeSummary) else each) for each in several]
+        log = await reading.log()
+        numbers = frozenset([(await episode_named(log, name)).number for name in names])
+    if tag is None:
         return numbers
-    tagged = await episodes.tagged(conditions.tag)
+    async with reading.session(simulated=True) as session:
+        rows = (await session.execute(select(EpisodeTag.process_metadata_id, EpisodeTag.tag))).all()
+    tagged = frozenset(number for number, each in rows if each == tag)
+    if not tagged:
+        raise CallerError(f"no episode has the tag {tag!r}{closest(tag, {each for _, each in rows})}")
     return tagged if numbers is None else numbers & tagged
-
-
-def _is_iterable(value: object) -> bool:
-    return isinstance(value, list | tuple | set | frozenset)
 
 
 def case_of(case: AnyCase, library: CaseLibrary) -> Case:

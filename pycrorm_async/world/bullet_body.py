@@ -424,8 +424,12 @@ def first_met(
     """Return Bullet's number of the first body on every ray, see `BulletWorld.ray_test`."""
     if len(starts) != len(ends):
         raise ValueError(f"every ray needs a start and an end, got {len(starts)} starts and {len(ends)} ends")
+    numbers: list[int] = []
     with _without_collisions(transparent):
-        return _hits(client, starts, ends)
+        for begin in range(0, len(starts), _RAYS_AT_ONCE):
+            chunk = slice(begin, begin + _RAYS_AT_ONCE)
+            numbers += [hit[0] for hit in engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)]
+    return numbers
 
 
 @contextmanager
@@ -451,23 +455,13 @@ def _group(body: Body, group: int) -> None:
 
 def inner_points(body: Body) -> list[list[float]]:
     """Return points in "map", m, that are spread through the shapes of a body; none for a body without shapes."""
-    return [point for link, solids in body.solids.items() if solids for point in _inner_points(body, link)]
-
-
-def _inner_points(body: Body, link: str) -> list[list[float]]:
-    position, turn = body.link_frame(link)
-    inner = np.concatenate([solid.inner_points for solid in body.solids[link]])
-    placed: list[list[float]] = (inner @ rotation_matrix(turn).T + np.array(position)).tolist()
-    return placed
-
-
-def _hits(client: int, starts: Sequence[Sequence[float]], ends: Sequence[Sequence[float]]) -> list[int]:
-    """Return Bullet's number of the first body on every ray."""
-    numbers: list[int] = []
-    for begin in range(0, len(starts), _RAYS_AT_ONCE):
-        chunk = slice(begin, begin + _RAYS_AT_ONCE)
-        numbers += [hit[0] for hit in engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)]
-    return numbers
+    points: list[list[float]] = []
+    for link, solids in body.solids.items():
+        if solids:
+            position, turn = body.link_frame(link)
+            inner = np.concatenate([solid.inner_points for solid in solids])
+            points += (inner @ rotation_matrix(turn).T + np.array(position)).tolist()
+    return points
 
 
 # === state ====================================================================================================

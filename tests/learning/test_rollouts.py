@@ -25,6 +25,7 @@ from pycrorm_async.learning import (
     rollouts,
     rollouts_question,
 )
+from pycrorm_async.learning.experiment import read_rollouts
 from pycrorm_async.learning.rollouts import BatchRolloutActionPerformable, randomness
 from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task import collected_tree
@@ -235,7 +236,8 @@ async def test_rollouts_that_were_repeated_count_once(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         for first, count in ((0, 20), (10, 20)):
             await rolled_out(count, first=first)
-        frame = rollouts.drop_repeats(await frame_of(memory))
+        await memory.flush()
+        frame = await read_rollouts(memory.reading, Scene(), name_of(default_policy()), 69, 30)
         assert frame["index"].tolist() == list(range(30))
 
 
