@@ -31,7 +31,7 @@ from __future__ import annotations
 import errno
 import mmap
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from gc import disable, enable, isenabled
 from itertools import pairwise
 from pathlib import Path
@@ -99,12 +99,11 @@ _FULL_EPISODE: Final = (
 
 
 class SegmentStart(NamedTuple):
-    """The beginning of a segment: `base` is the position of its first record, `opened` the episodes open before it."""
+    """The beginning of a segment: `base` is the position of its first record."""
 
     number: int
     base: int
     path: Path
-    opened: Mapping[EpisodeId, LastRecord]
 
 
 class SyncSpan(NamedTuple):
@@ -291,7 +290,7 @@ class Appender:
         salt = salt_of(self._recorder, segment.number)
         before = AppendState(offset, self.position, self._span_count, self._span_checksum)
         repeated = self.declarations.write(segment.buffer, before, salt=salt, clock=self._clock)
-        begun = [*self.begun, SegmentStart(segment.number, base, segment.path, open_before)]
+        begun = [*self.begun, SegmentStart(segment.number, base, segment.path)]
         sealed = [*self._sealed, self._current] if self.begun else []
         # As in `put`: no calls between these steps.
         self._current = segment

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from struct import Struct
 from types import MappingProxyType
-from typing import BinaryIO, Final, NamedTuple
+from typing import Final, NamedTuple
 from zlib import crc32
 
 from pycrorm_async.errors import SpoolUnavailable
@@ -234,11 +234,6 @@ def open_file(path: Path, flags: int) -> int:
         return os.open(path, flags | os.O_CLOEXEC)
     os.fchmod(descriptor, FILE_MODES[_access_below(path.parent)])
     return descriptor
-
-
-def rewrite(path: Path) -> BinaryIO:
-    """Open a file for writing, truncated. Raises `OSError`."""
-    return os.fdopen(open_file(path, os.O_WRONLY | os.O_TRUNC), "wb")
 
 
 def _make(path: Path, access: FileAccess) -> None:

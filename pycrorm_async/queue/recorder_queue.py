@@ -51,7 +51,8 @@ from pycrorm_async.queue.locks import ALIVE, DRAIN, FileIdentity, FileLock, call
 from pycrorm_async.queue.sources import DeadLetters
 from pycrorm_async.queue.spool import (
     DrainStatus,
-    DrainStatusReader,
+    Progress,
+    RecorderStatus,
     Spool,
     make_folder,
     remove_folder,
@@ -114,7 +115,7 @@ class RecorderQueue:
             )
             if self._appender.prepare():
                 self._sync_thread.call_in(PROGRESS_INTERVAL_S)
-            self._drain_status = DrainStatusReader(folder) if offered else None
+            self._progress = Progress.make(folder) if offered else None
             self._identity = FileIdentity.of(folder.stat())
         self._blobs = LiveBlobs(folder, reserve=self._appender.reserve_blob, make_room=self._stored_segments.make_room)
         self._source = OwnSource(self, self._notifier, ReadPlace(folder, recorder, ReadCursor(1, header_bytes(0), 0)))
@@ -226,7 +227,7 @@ class RecorderQueue:
     def _room_is_decided(self, *, reserved: bool) -> bool:
         if self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved):
             return True
-        if self._drain_status is not None:
+        if self._progress is not None:
             self._sync_thread.call_in(PROGRESS_INTERVAL_S)
         return False
 
@@ -261,14 +262,17 @@ class RecorderQueue:
     @property
     def stored(self) -> int:
         """Last acknowledged position."""
-        if self._drain_status is None:
-            return self._stored
-        return max(self._stored, self._drain_status.read(synced=self._synced).stored)
+        status = self.external_drain_status
+        return self._stored if status is None else max(self._stored, status.stored)
 
     @property
     def external_drain_status(self) -> DrainStatus | None:
         """The drain status from another process, if plausible; None if this process drains the queue."""
-        return None if self._drain_status is None else self._drain_status.read(synced=self._synced)
+        if self._progress is None:
+            return None
+        status = self._progress.drained()
+        # No drainer can have a position beyond `_synced`.
+        return DrainStatus() if max(status.stored, status.folded) > self._synced else status
 
     def ends_at(self, position: int) -> bool:
         """Return whether no record will follow this position."""
@@ -398,8 +402,8 @@ class RecorderQueue:
                     self._keep_last_segments()
                     remove_folder(self.folder)
         finally:
-            if self._drain_status is not None:
-                self._drain_status.close()
+            if self._progress is not None:
+                self._progress.close()
             self._source.release()
             self._alive.release()
 
@@ -430,7 +434,8 @@ class RecorderQueue:
         try:
             if not self._sync():
                 return None
-            published = self._drain_status is None or self._exchange(self._drain_status)
+            published = self._publish()
+            self._read_progress()
             self._trim()
             full = self._prepare()
         except OSError as error:
@@ -442,18 +447,17 @@ class RecorderQueue:
             raise
         if full:
             return min(self._sync_interval_s, PROGRESS_INTERVAL_S)  # plans may wait for the space
-        waiting = self._drain_status is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
+        waiting = self._progress is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
         return PROGRESS_INTERVAL_S if waiting or not published else None
 
-    def _exchange(self, drain_status: DrainStatusReader) -> bool:
-        """Publish the synced position to the drainer and read its status; False if publishing failed."""
-        published = self._publish(drain_status)
-        status = drain_status.read(synced=self._synced)
-        self._stored = max(self._stored, status.stored)
-        if status.note.failure != self._appender.stuck:
-            self._appender.stuck = status.note.failure
-            self._room_notifier.notify_all()
-        return published
+    def _read_progress(self) -> None:
+        """Read how far the drainer in another process is, and whether it has stopped."""
+        status = self.external_drain_status
+        if status is not None:
+            self._stored = max(self._stored, status.stored)
+            if status.note.failure != self._appender.stuck:
+                self._appender.stuck = status.note.failure
+                self._room_notifier.notify_all()
 
     def _sync(self) -> bool:
         """Sync what was put; return False if another program has deleted or replaced the files."""
@@ -473,8 +477,7 @@ class RecorderQueue:
         self._appender.touch_ahead()
         self._safe_number = span.segments[-1].number
         self._synced = span.position
-        if self._drain_status is not None:
-            self._publish(self._drain_status)  # before waiters of this process run
+        self._publish()  # before waiters of this process run
         self._notifier.notify_all()
         return True
 
@@ -484,8 +487,15 @@ class RecorderQueue:
             return self.folder / ALIVE
         return next((segment.path for segment in dict.fromkeys(segments) if not segment.is_in_place), None)
 
-    def _publish(self, drain_status: DrainStatusReader) -> bool:
-        return drain_status.publish(synced=self._synced, closed=self._closed and self._synced == self.written)
+    def _publish(self) -> bool:
+        """Write the synced position for the drainer in another process; return False if that must be retried."""
+        if self._progress is not None:
+            try:
+                is_last = self._closed and self._synced == self.written
+                self._progress.write_recorder_status(RecorderStatus(self._synced, is_last))
+            except OSError:  # must not refuse the plan's events
+                return False
+        return True
 
     def _trimmable(self) -> bool:
         return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))

@@ -58,7 +58,6 @@ from pycrorm_async.queue.locks import (
     is_locked,
     open_file,
     read_note,
-    rewrite,
 )
 from pycrorm_async.settings import FileAccess
 
@@ -326,7 +325,7 @@ def _is_begun(segment: Path) -> bool:
 def write_durably(path: Path, content: bytes) -> None:
     """Replace a file's content atomically, also across a power cut. Raises `OSError`."""
     unfinished = path.with_name(f"{path.name}{MAKING}")
-    with rewrite(unfinished) as file:
+    with os.fdopen(open_file(unfinished, os.O_WRONLY | os.O_TRUNC), "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
@@ -390,7 +389,12 @@ class Progress:
 
     @classmethod
     def make(cls, folder: Path) -> Progress:
-        """Create the file; it gets its name only when it is complete. Raises `OSError`."""
+        """Create the file, which offers the folder to a drainer in another process. Raises `OSError`.
+
+        It gets its name only when it is complete. Creates `drain` too: a drainer that created it could recreate a
+        folder that is being deleted.
+        """
+        os.close(open_file(folder / DRAIN, os.O_WRONLY))
         path = folder / PROGRESS
         unfinished = path.with_suffix(".making")
         descriptor = open_file(unfinished, os.O_RDWR | os.O_TRUNC)
@@ -398,7 +402,6 @@ class Progress:
             os.posix_fallocate(descriptor, 0, _FILE_BYTES)
             os.pwrite(descriptor, _MAGIC, 0)
             progress = cls(descriptor)
-            progress.write_recorder_status(RecorderStatus())
             progress.write_drain_status(_NOTHING_DRAINED)
             unfinished.rename(path)
         except BaseException:
@@ -435,9 +438,12 @@ class Progress:
         return self._recorded
 
     def write_recorder_status(self, status: RecorderStatus) -> None:
-        """Write the recorder's status; only the recorder may. Raises `OSError`."""
+        """Write the recorder's status if it changed; only the recorder may. Raises `OSError`."""
+        if status == self._recorded:
+            return
         content = _RECORDER.pack(status.synced, status.closed, 0)[:-4]
         self._write(content + crc32(content).to_bytes(4, _ORDER), _RECORDER_AT)
+        self._recorded = status
 
     def drained(self) -> DrainStatus:
         """Read the drainer's status; a status that cannot be read leaves the previous one in force."""
@@ -495,36 +501,3 @@ def _encode_note(note: DrainNote) -> bytes:
 
 def _shorten(text: str | None) -> str | None:
     return text if text is None else text[:_REASON_CHARACTERS_MAX]
-
-
-class DrainStatusReader:
-    """The recorder's side of `progress`. Constructing one offers the folder to a drainer in another process."""
-
-    def __init__(self, folder: Path) -> None:
-        """Create `progress` and `drain`. Raises `OSError`."""
-        # Create `drain` here: a drainer that created it could recreate a folder that is being deleted.
-        os.close(open_file(folder / DRAIN, os.O_WRONLY))
-        self._progress = Progress.make(folder)
-        self._published = RecorderStatus()
-
-    def publish(self, *, synced: int, closed: bool) -> bool:
-        """Write the recorder's status if it changed; False if the write failed and must be retried."""
-        status = RecorderStatus(synced, closed)
-        if status != self._published:
-            try:
-                self._progress.write_recorder_status(status)
-            except OSError:  # must not refuse the plan's events; the sync thread retries
-                return False
-            self._published = status
-        return True
-
-    def read(self, *, synced: int) -> DrainStatus:
-        """Read the drainer's status; one with positions beyond `synced`, which no drainer can have, counts as empty."""
-        status = self._progress.drained()
-        if max(status.stored, status.folded) > synced:
-            return DrainStatus()
-        return status
-
-    def close(self) -> None:
-        """Close the file; the last status read stays in force."""
-        self._progress.close()

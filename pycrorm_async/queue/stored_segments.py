@@ -35,7 +35,6 @@ FILES_MAX: Final = 4_096
 
 _PRUNE_INTERVAL_NS: Final = 60 * 10**9
 """Interval at which a process that keeps segments deletes those that are too old."""
-_ATTEMPTS: Final = 5
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -159,17 +158,13 @@ class StoredSegments:
             now_ns = self._wall_ns()
             os.utime(segment, ns=(now_ns, now_ns))
             target = folder / segment.parent.name / segment.name
-            for _ in range(_ATTEMPTS):
-                create_folders(self._spool, target.parent)
-                with suppress(FileNotFoundError):  # another process deleted the folder, which was empty
-                    if blobs:
-                        create_folders(self._spool, kept_with(target))
-                    for blob in blobs:
-                        with suppress(FileNotFoundError):
-                            blob.replace(kept_with(target) / blob.name)
-                    segment.rename(target)
-                    return target.stat().st_size + _blob_bytes(target)
-        except FileNotFoundError:  # a process that was then killed has moved it already
+            create_folders(self._spool, kept_with(target) if blobs else target.parent)
+            for blob in blobs:
+                with suppress(FileNotFoundError):
+                    blob.replace(kept_with(target) / blob.name)
+            segment.rename(target)
+            return target.stat().st_size + _blob_bytes(target)
+        except FileNotFoundError:  # a process that was then killed has moved it, or another deleted the empty folder
             return 0
         except (OSError, SpoolUnavailable) as error:
             _log.warning(
