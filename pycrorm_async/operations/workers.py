@@ -38,7 +38,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import gc
 import logging
 import multiprocessing
 import os
@@ -433,7 +432,7 @@ class ChildProcess(NamedTuple):
         try:
             process = context.Process(
                 target=_run,
-                args=(_Entry(entry), theirs, *args),
+                args=(entry, theirs, *args),
                 kwargs={"inherited": inherited, "dies_with_parent": dies_with_parent},
                 name=name,
                 daemon=True,
@@ -487,30 +486,6 @@ async def _readable(descriptor: int) -> None:
         await readable.wait()
     finally:
         loop.remove_reader(descriptor)
-
-
-class _Entry(NamedTuple):
-    """The function that a child calls. A spawned child imports it without garbage collections.
-
-    Nothing becomes garbage while modules are loaded, and collections would take a sixth of the start.
-    """
-
-    function: Callable[..., None]
-
-    def __call__(self, *args: object) -> None:
-        self.function(*args)
-
-    def __reduce__(self) -> tuple[Callable[[str, str], _Entry], tuple[str, str]]:
-        return _import_entry, (self.function.__module__, self.function.__qualname__)
-
-
-def _import_entry(module: str, name: str) -> _Entry:
-    gc.disable()
-    try:
-        return _Entry(getattr(import_module(module), name))
-    finally:
-        gc.freeze()
-        gc.enable()
 
 
 def _run(
