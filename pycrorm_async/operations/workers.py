@@ -141,7 +141,6 @@ class FoldWorker:
         self._clock = clock
         self._forked = forked
         self._process: ChildProcess | None = None
-        self._fault: str | None = None
         self._changed = asyncio.Event()
 
     async def started(self, *, restarts_max: int) -> bool:
@@ -210,29 +209,22 @@ class FoldWorker:
         except OSError as error:
             return name, f"cannot be started: {error}"
         self._change("starting", pid=process.pid)
-        opening = asyncio.create_task(self._open(process), name=f"pycrorm {name} opens")
         try:
+            with suppress(FoldWorkerLost):
+                await self._exchange(process, self._assignment)
+                self._process, self.is_ready = process, True
+                self._change("running")
             code = await process.ended()
+            reason = f"exited with signal {-code}" if code < 0 else f"exited with exit code {code}"
+        except Exception as error:  # noqa: BLE001 - such as a projection that cannot be pickled; reported at restart
+            reason = f"cannot receive its assignment: {error}"
         finally:
             self.is_ready, self._process = False, None
             process.kill()
-            opening.cancel()
-            await asyncio.gather(opening, return_exceptions=True)
+            process.process.join()
+            await asyncio.sleep(0)  # a request must meet the end of the connection before the connection is closed
             process.end()
-        cause = f"exited with signal {-code}" if code < 0 else f"exited with exit code {code}"
-        reason, self._fault = self._fault or cause, None
         return f"{name} (pid {process.pid})", reason
-
-    async def _open(self, process: ChildProcess) -> None:
-        try:
-            await self._exchange(process, self._assignment)
-        except FoldWorkerLost:
-            return
-        except Exception as error:  # noqa: BLE001 - such as a projection that cannot be pickled; reported at restart
-            self._fault = f"cannot receive its assignment: {error}"
-            return
-        self._process, self.is_ready = process, True
-        self._change("running")
 
     async def _exchange(self, process: ChildProcess, message: object) -> Any:
         """Send a message and return the answer. Raises `FoldWorkerLost`.

@@ -25,7 +25,7 @@ import asyncio
 import math
 import random
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple, TypeVar
 
@@ -231,11 +231,11 @@ class Daemon:
             await self._appended_events.wait()
             self._appended_events.clear()
             try:
-                while await self._availability.observe(self._tables.fold_next_batch()):
+                more = True
+                while more:
+                    more = await self._availability.observe(self._tables.fold_next_batch())
                     self._publish_pending(None)
                     await self._publish_visibility()
-                self._publish_pending(None)
-                await self._publish_visibility()
             except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
                 attempt += 1
                 if isinstance(error, TablesPending):
@@ -260,42 +260,36 @@ class Daemon:
             await asyncio.sleep(_CONFIRM_S)
 
     async def _publish_visibility(self) -> None:
-        before = [(each, each.drain.state.appended) for each in self._serving.values()]
+        before = {each: each.drain.state.appended for each in self._serving.values()}
         behind = await self._availability.observe(self._tables.behind())
         stopped = await self._availability.observe(self._tables.stopped())
-        for tracker, appended in before:
-            try:
-                tracker.note(appended, behind, stopped)
-            except FilesError as error:  # the drain meets the same disk error and reports it
-                self._report(f"recorder {tracker.source.name}: {error}")
+        self._publish(lambda each: each.note(before[each], behind, stopped), before)
 
     def _publish_pending(self, reason: str | None) -> None:
         if reason != self._pending:
             self._pending = reason
-            for tracker in self._serving.values():
-                try:
-                    tracker.mark_pending(reason)
-                except FilesError as error:
-                    self._report(f"recorder {tracker.source.name}: {error}")
+            self._publish(lambda each: each.mark_pending(reason), self._serving.values())
+
+    def _publish(self, publish: Callable[[VisibilityTracker], None], trackers: Iterable[VisibilityTracker]) -> None:
+        for tracker in trackers:
+            try:
+                publish(tracker)
+            except FilesError as error:  # the drain meets the same disk error and reports it
+                self._report(f"recorder {tracker.source.name}: {error}")
 
     # --- reports --------------------------------------------------------------------------------------
 
     def _note_lost(self, reason: str) -> None:
-        self._unavailable = reason
         self._report(f"the database is unavailable: {reason}; retrying")
-        self._publish_availability()
+        self._publish_availability(reason)
 
     def _note_back(self, after_s: float) -> None:
-        self._unavailable = None
         self._report(f"the database is available again after {after_s:.1f} s")
-        self._publish_availability()
+        self._publish_availability(None)
 
-    def _publish_availability(self) -> None:
-        for tracker in self._serving.values():
-            try:
-                tracker.source.mark_unavailable(self._unavailable)
-            except FilesError as error:
-                self._report(f"recorder {tracker.source.name}: {error}")
+    def _publish_availability(self, reason: str | None) -> None:
+        self._unavailable = reason
+        self._publish(lambda each: each.source.mark_unavailable(reason), self._serving.values())
 
     def _report_if_new(self, line: str, about: str) -> None:
         """Report a line unless it was the last one about this subject."""
