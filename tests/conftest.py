@@ -23,7 +23,7 @@ from tests.commands import fork_child
 from tests.databases import Server, put_memory, server_in_memory
 from tests.long_modules import long_modules_first
 from tests.report.browser import Browser, browser, chromium
-from tests.soak_turns import SLOW_AT_EACH_COMMIT, current_commit, place_of, turn_of
+from tests.soak_turns import current_commit, place_of, runs_in_turns, turn_of
 
 # A busy machine must not fail a test by its time; Hypothesis measures its deadline on the wall clock.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -124,13 +124,15 @@ def pytest_collection(session: pytest.Session) -> None:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_pycollect_makeitem(collector: pytest.Module | pytest.Class, obj: object) -> list[pytest.Item] | None:
+def pytest_pycollect_makeitem(
+    collector: pytest.Module | pytest.Class, name: str, obj: object
+) -> list[pytest.Item] | None:
     """Make no items of the tests that the marks of this run leave out: each process would only deselect them."""
     own = getattr(obj, "pytestmark", ())
-    names = {each.name for each in (*collector.iter_markers(), *(own if isinstance(own, list) else ()))}
-    if "slow" in names and collector.path.parent.name not in SLOW_AT_EACH_COMMIT:
-        names.add("soak")
-    return [] if names & _left_out(collector.config) else None
+    marks = {each.name for each in (*collector.iter_markers(), *(own if isinstance(own, list) else ()))}
+    if "slow" in marks and runs_in_turns(collector.path, name):
+        marks.add("soak")
+    return [] if marks & _left_out(collector.config) else None
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -180,7 +182,7 @@ def _select(config: pytest.Config, items: list[pytest.Item]) -> None:
         variants = (
             item.callspec.params.values() if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ()
         )
-        in_turns = item.get_closest_marker("slow") and item.path.parent.name not in SLOW_AT_EACH_COMMIT
+        in_turns = item.get_closest_marker("slow") and runs_in_turns(item.path, item.name.partition("[")[0])
         if in_turns or any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants):
             item.add_marker(pytest.mark.soak)
     commit = config.getoption("--soak-turn")

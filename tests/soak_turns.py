@@ -11,6 +11,7 @@ that of `FIXED`.
 from __future__ import annotations
 
 import hashlib
+import re
 import subprocess
 from pathlib import Path
 from typing import Final
@@ -19,7 +20,12 @@ TURNS: Final = 20
 """Twenty turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
 SLOW_AT_EACH_COMMIT: Final = frozenset({"crash", "promises", "pycram"})
-"""The folders whose slow tests run at each commit. Those of the others are soak: the test command stays short."""
+"""The folders whose slow tests run at each commit, as do the tests that tests/README.md names for promises and defects.
+
+All other slow tests are soak, so that the test command stays short.
+"""
+NAMED: Final = frozenset(re.findall(r"`(test_\w+)`", (Path(__file__).parent / "README.md").read_text()))
+"""The tests that tests/README.md names."""
 
 
 def turn_of(commit: str) -> int:
@@ -30,6 +36,11 @@ def turn_of(commit: str) -> int:
 def place_of(node_id: str) -> int:
     """Return the turn in which the test with this node id runs."""
     return int.from_bytes(hashlib.sha256(node_id.encode()).digest()[:8], "big") % TURNS
+
+
+def runs_in_turns(file: Path, test: str) -> bool:
+    """Return whether a slow test of this file is soak."""
+    return file.parent.name not in SLOW_AT_EACH_COMMIT and test not in NAMED
 
 
 def current_commit(folder: Path) -> str:
