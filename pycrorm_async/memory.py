@@ -60,10 +60,9 @@ from pycrorm_async.projections.custom import Projection, validate_projections
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.question import Question, SyncQuestion
+from pycrorm_async.query.question import AskedEpisode, Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading, memory_html
-from pycrorm_async.query.snapshot import AnyEpisode
 from pycrorm_async.query.success import Kind, Source, success_figure, success_samples
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
@@ -416,7 +415,7 @@ class Memory:
             async with _episode_of(parts.recorder, description=text, plan=plan, seed=seed, labels=labels) as episode:
                 yield episode
 
-    async def tag(self, episode: AnyEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
+    async def tag(self, episode: AskedEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
         """Add and remove tags of an episode of this database: a number, id, `last`, or object.
 
         Tags of an episode that is open in this memory are recorded in it; those of one that has ended are written
@@ -574,7 +573,7 @@ class Memory:
 
     async def report(
         self,
-        episode: AnyEpisode,
+        episode: AskedEpisode,
         path: str | PathLike[str] | None = None,
         *,
         force: bool = False,
@@ -584,7 +583,7 @@ class Memory:
         """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
         return await write_report(self.reading, episode, path, force=force, first=first, last=last)
 
-    async def picture(self, /, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
+    async def picture(self, /, episode: AskedEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
         """Return the scene of an episode at a moment as PNG, up to the last flush.
 
         >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import msgspec
 import typer
@@ -232,8 +232,8 @@ class Chosen(NamedTuple):
         """Return the choice, by default of at most this many."""
         from pycrorm_async.query.named_queries import EpisodeChoice  # loads the mapped classes
 
-        since, tags = parse_since(self.since), tuple(self.tag or ())
-        return EpisodeChoice(self.status, since, tags, self.robot, self.text, self.limit or limit)
+        since = None if self.since is None else parse_since(self.since)
+        return EpisodeChoice(self.status, since, tuple(self.tag or ()), self.robot, self.text, self.limit or limit)
 
 
 class Form(NamedTuple):
@@ -269,12 +269,8 @@ _UNITS = {
 }
 
 
-@overload
-def parse_since(text: str, now: datetime | None = None) -> datetime: ...
-@overload
-def parse_since(text: str | None, now: datetime | None = None) -> datetime | None: ...
-def parse_since(text: str | None, now: datetime | None = None) -> datetime | None:
-    """Return the time, or None without a text.
+def parse_since(text: str, now: datetime | None = None) -> datetime:
+    """Return the time.
 
     A time without a zone is in UTC, as the verbs print times; an age counts back from `now`.
 
@@ -283,8 +279,6 @@ def parse_since(text: str | None, now: datetime | None = None) -> datetime | Non
 
     Raises `CallerError` for another text.
     """
-    if text is None:
-        return None
     try:
         if age := _AGE.fullmatch(text.strip()):
             return (now or datetime.now(UTC)) - int(age[1]) * _UNITS[age[2]]

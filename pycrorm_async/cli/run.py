@@ -42,6 +42,12 @@ _SAMPLE_INTERVAL_MS = range(1, 86_400_001)
 """Bounds `--sample-interval-ms`: a day, longer than any motion."""
 
 
+def _one_of(choices: Any, purpose: str) -> Any:
+    """Return an option of one of the literals; `_choice` checks it, so that a wrong one is reported in one line."""
+    names = list(get_args(choices))
+    return typer.Option(metavar="|".join(names), autocompletion=lambda: names, help=purpose)
+
+
 def run(
     *,
     plan: Annotated[
@@ -69,27 +75,17 @@ def run(
     ] = None,
     on_unrecordable: Annotated[
         str,
-        typer.Option(
-            metavar="|".join(get_args(OnUnrecordable)),
-            autocompletion=lambda: list(get_args(OnUnrecordable)),
-            help="A parameter that cannot be recorded is recorded as missing, or its perform is refused.",
+        _one_of(
+            OnUnrecordable, "A parameter that cannot be recorded is recorded as missing, or its perform is refused."
         ),
     ] = "record_missing",
     on_full: Annotated[
         str,
-        typer.Option(
-            metavar="|".join(get_args(OnFull)),
-            autocompletion=lambda: list(get_args(OnFull)),
-            help="A node that starts while the spool is full waits for space, or fails.",
-        ),
+        _one_of(OnFull, "A node that starts while the spool is full waits for space, or fails."),
     ] = "wait",
     record_meshes: Annotated[
         str,
-        typer.Option(
-            metavar="|".join(get_args(RecordMeshes)),
-            autocompletion=lambda: list(get_args(RecordMeshes)),
-            help="Record the meshes of objects as boxes, or also the files.",
-        ),
+        _one_of(RecordMeshes, "Record the meshes of objects as boxes, or also the files."),
     ] = "boxes",
     show_traceback: Annotated[
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")

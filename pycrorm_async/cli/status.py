@@ -65,19 +65,6 @@ class KeptSegments:
     since: datetime | None
 
 
-@dataclass(frozen=True)
-class Durability:
-    """The database's report on stored events.
-
-    Attributes:
-        stored_on: number of machines that hold each stored event, and the names of the synchronous standbys.
-        went_back: each time at which the log was noticed to have lost stored events.
-    """
-
-    stored_on: StoredOn
-    went_back: list[Incarnation]
-
-
 def summarise_kept_segments(spool: Path) -> KeptSegments:
     """Summarise the segments kept in a spool after their events were stored. Raises `SpoolUnavailable`."""
     with wrap_os_errors(spool):
@@ -87,15 +74,10 @@ def summarise_kept_segments(spool: Path) -> KeptSegments:
     )
 
 
-async def durability(log: EventLog) -> Durability:
-    """Query the durability of a log. Raises `DatabaseUnavailable`."""
-    return Durability(await log.stored_on(), await log.incarnations())
-
-
-def print_durability(kept: KeptSegments, durability: Durability | None) -> None:
-    """Print the durability in sentences; `durability` is None if the database did not answer."""
-    if durability is not None:
-        machines, standbys = durability.stored_on
+def print_durability(kept: KeptSegments, stored_on: StoredOn | None, went_back: Sequence[Incarnation]) -> None:
+    """Print the durability in sentences; `stored_on` is None if the database did not answer."""
+    if stored_on is not None:
+        machines, standbys = stored_on
         replicas = f" (synchronous standby {', '.join(standbys)})" if standbys else ""
         stdout.print(f"A stored event is on {machines} machine{'s' * (machines > 1)}{replicas}.", markup=False)
     if kept.since is None:
@@ -106,11 +88,11 @@ def print_durability(kept: KeptSegments, durability: Durability | None) -> None:
     else:
         size = f"{kept.segments:,} segment{'s' * (kept.segments != 1)}, {kept.bytes / 2**20:,.1f} MiB"
         stdout.print(
-            f"After a data loss, events stored since {_text(kept.since)} can be stored again ({size} kept).",
+            f"After a data loss, events stored since {moment(kept.since)} UTC can be stored again ({size} kept).",
             markup=False,
         )
-    for each in durability.went_back if durability is not None else ():
-        when = _text(_moment(each.noticed_wall_ns))
+    for each in went_back:
+        when = f"{moment(_moment(each.noticed_wall_ns))} UTC"
         stdout.print(
             f"The database lost stored events, noticed {when} by {each.noticed_by}: {each.reason}", markup=False
         )
@@ -118,10 +100,6 @@ def print_durability(kept: KeptSegments, durability: Durability | None) -> None:
 
 def _moment(wall_ns: int) -> datetime:
     return datetime.fromtimestamp(wall_ns / 1e9, UTC)
-
-
-def _text(moment: datetime) -> str:
-    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
 
 
 # === status ===================================================================================================
@@ -196,6 +174,8 @@ class DatabaseState:
         running: the newest running episodes; `running_total` counts all of them.
         warnings: limits that are near, and what the tables or recall leave out.
         unmade, failed_views: the reasons why designator types have no tables and views are left out, by name.
+        stored_on: number of machines that hold each stored event, and the names of the synchronous standbys.
+        went_back: each time at which the log was noticed to have lost stored events.
     """
 
     episodes: Sequence[EpisodeState] = ()
@@ -205,7 +185,8 @@ class DatabaseState:
     warnings: Sequence[str] = ()
     unmade: Mapping[str, str] = field(default_factory=dict)
     failed_views: Mapping[str, str] = field(default_factory=dict)
-    durability: Durability | None = None
+    stored_on: StoredOn | None = None
+    went_back: Sequence[Incarnation] = ()
     are_tables_outdated: bool = False
 
 
@@ -249,10 +230,10 @@ def status(place: Place, as_json: JsonOption = False) -> int:
                 "unmade": state.unmade,
                 "failed_views": state.failed_views,
                 "kept": kept,
-                "stored_on": None if state.durability is None else state.durability.stored_on._asdict(),
+                "stored_on": state.stored_on and state.stored_on._asdict(),
                 "running": state.running,
                 "running_total": state.running_total,
-                "went_back": [] if state.durability is None else [e._asdict() for e in state.durability.went_back],
+                "went_back": [each._asdict() for each in state.went_back],
             }
         )
     else:
@@ -260,7 +241,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
         _print(spool, recorders, state.episodes, has_daemon=has_daemon, is_shown=is_shown)
         _print_running(state.running, state.running_total)
         _print_workers(workers)
-        print_durability(kept, state.durability)
+        print_durability(kept, state.stored_on, state.went_back)
         for projection in state.projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
@@ -385,7 +366,8 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
             [*outdated, *await log.limits_near(), *await _left_out_of_recall(log), *await contradictions(log)],
             await unmade_types(log),
             await failed_views(log),
-            await durability(log),
+            await log.stored_on(),
+            await log.incarnations(),
             bool(outdated),
         )
     finally:

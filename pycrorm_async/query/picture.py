@@ -23,8 +23,9 @@ from pycrorm_async.events.ids import row_key
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectRemoval
 from pycrorm_async.query.again import RecordedWorld, world_of
+from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import AnyEpisode, Moment, parse_moment
+from pycrorm_async.query.snapshot import Moment, parse_moment
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries import Camera, photograph
@@ -44,7 +45,7 @@ _YAWS = range(0, 360, 30)
 
 async def picture(
     reading: Reading,
-    episode: AnyEpisode,
+    episode: AskedEpisode,
     *,
     at: MomentReference = None,
     width: int = 640,
@@ -89,7 +90,7 @@ async def picture(
     return await asyncio.to_thread(Context().run, _drawn, then, moved, (width, height), yaw_deg, pitch_deg)
 
 
-async def _moment(reading: Reading, episode: AnyEpisode, at: MomentReference) -> Moment:
+async def _moment(reading: Reading, episode: AskedEpisode, at: MomentReference) -> Moment:
     if isinstance(at, str):
         time, sequence = parse_moment(at)
         return await reading.as_of(episode, time=time, sequence=sequence, meshes=True)

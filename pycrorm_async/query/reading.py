@@ -50,7 +50,7 @@ from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.query.notebook import Episodes, TaskTree  # and registers the views of values
 from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion, translated_errors
 from pycrorm_async.query.questions import Ask
-from pycrorm_async.query.snapshot import AnyEpisode, Moment, as_of
+from pycrorm_async.query.snapshot import Moment, as_of
 from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.query.text import quiet, view
 from pycrorm_async.store.address import DatabaseAddress, no_tables
@@ -305,7 +305,7 @@ class Reading:
             async with self._connection(simulated=True) as connection:
                 return await named_queries.episode_named(connection, name)
 
-    async def tree(self, episode: AnyEpisode) -> TaskTree:
+    async def tree(self, episode: AskedEpisode) -> TaskTree:
         """Return the task tree of an episode, simulations included, as a list: each node comes before its children.
 
         A notebook draws it. Raises `UnknownEpisode` for a name that no episode has; for an unknown number it is empty.
@@ -324,7 +324,7 @@ class Reading:
 
     async def as_of(
         self,
-        episode: AnyEpisode,
+        episode: AskedEpisode,
         *,
         time: float | datetime | None = None,
         sequence: int | None = None,

@@ -18,13 +18,14 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
+from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.replay import LATEST_MAX, EpisodeReplay, ReplayedNode, WorldObject
 from pycrorm_async.query.text import NotebookValue
 from pycrorm_async.store.log import EventLog, episode_named
@@ -33,9 +34,6 @@ from pycrorm_async.visible_text import visible
 from pycrorm_async.world.bullet_body import ObjectState, WorldState
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
-
-if TYPE_CHECKING:
-    from pycrorm_async.record.plan_recorder import Episode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,9 +214,6 @@ class Moment(NotebookValue):
 # It reads the log and not the tables, which contain only the final state of each node. So it also works for events that
 # are not folded yet, and for parked episodes. It reads no further than one page beyond the moment.
 
-AnyEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
-"""An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
-
 _NUMBERS_END = 1e15
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -228,7 +223,7 @@ _Within: TypeAlias = Callable[[int, StoredEvent], bool]
 
 async def as_of(
     log: EventLog,
-    episode: AnyEpisode,
+    episode: AskedEpisode,
     *,
     time: float | datetime | None = None,
     sequence: int | None = None,

@@ -1,27 +1,4 @@
-"""Run SQL that a user or a program wrote, on connections that can only read.
-
-**Postgresql reader.** Run one query on a PostgreSQL server, on a connection that can only read.
-
-**Theory of operation.** A read-only transaction is not enough: as a superuser, `pg_read_file` reads files of the server
-and COPY … TO PROGRAM runs programs on it. Four independent checks apply:
-
-1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere. Or it takes this role
-   for the transaction, as the owner on a laptop does. Code that runs in the query could then return to the login's
-   rights, so none may be there: no function but PostgreSQL's own is called, and what the reader can reach, such as a
-   view or a domain, belongs to the login itself or to roles that have its rights anyway (`_PLANTED`).
-2. The text is prepared, so it is one statement, and becomes the query of a cursor: PostgreSQL takes nothing but SELECT,
-   VALUES and TABLE there, no SET, COPY, DO, CALL or SELECT INTO.
-3. The transaction is READ ONLY and always rolled back, and the connection is closed after it.
-4. A function that PostgreSQL declares VOLATILE may have effects that no rollback undoes: it ends other sessions, takes
-   locks, changes settings, runs a text as SQL. A text with the name of one, or of an operator or aggregate over one, is
-   refused. Strings and comments count too, because leaving them out would need PostgreSQL's own lexer. A view, a cast
-   or a type calls functions that the text does not name. One outside the memory, which every login may use, over a
-   volatile function with the rights of its owner, gives these rights to each query.
-
-The cursor returns with each row the sum of the bytes up to it, and empty values from the bound on, because one value
-can have a gigabyte.
-
-**Read only.** Run one SQL query that can only read, with bounds on its time, rows and bytes.
+"""Run SQL that a user or a program wrote, with bounds on its time, rows and bytes, on connections that can only read.
 
 sql = ReadOnlySql(log)
 result = await sql.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GROUP BY dtype")
@@ -30,10 +7,10 @@ async with sql.stream("SELECT * FROM event", SqlLimits(rows=None)) as rows:
 
 **Theory of operation.** The text of a query is untrusted: a user or a language model wrote it. Each query has a
 connection of its own, which is closed after it, so that no setting, lock or temporary table outlives a query. The
-database refuses everything but reading: SQLite through an authorizer, in a process with limits (section "sqlite
-reader"), PostgreSQL through a login without other rights, a read-only transaction and a cursor (section "postgresql
-reader"). Parsing the text here would not do, because a parser that differs from the database's in one detail would let
-a statement through.
+database refuses everything but reading, each by its own means: SQLite by an authorizer, in a process with limits
+(section "sqlite reader"), PostgreSQL by a login without other rights, a read-only transaction and a cursor (section
+"postgresql reader"). Parsing the text here would not do, because a parser that differs from the database's in one
+detail would let a statement through.
 
 A query that reaches a bound on time is stopped: SQLite's process is killed, a server cancels it. One that reaches a
 bound on rows or bytes ends early, and `more` is True.
@@ -94,6 +71,27 @@ def _value(value: Any) -> Any:
 
 
 # === postgresql reader ========================================================================================
+#
+# Run one query on a PostgreSQL server, on a connection that can only read.
+#
+# **Theory of operation.** A read-only transaction is not enough: as a superuser, `pg_read_file` reads files of the
+# server and COPY … TO PROGRAM runs programs on it. Four independent checks apply:
+#
+# 1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere. Or it takes this role
+#    for the transaction, as the owner on a laptop does. Code that runs in the query could then return to the login's
+#    rights, so none may be there: no function but PostgreSQL's own is called, and what the reader can reach, such as a
+#    view or a domain, belongs to the login itself or to roles that have its rights anyway (`_PLANTED`).
+# 2. The text is prepared, so it is one statement, and becomes the query of a cursor: PostgreSQL takes nothing but
+#    SELECT, VALUES and TABLE there, no SET, COPY, DO, CALL or SELECT INTO.
+# 3. The transaction is READ ONLY and always rolled back, and the connection is closed after it.
+# 4. A function that PostgreSQL declares VOLATILE may have effects that no rollback undoes: it ends other sessions,
+#    takes locks, changes settings, runs a text as SQL. A text with the name of one, or of an operator or aggregate over
+#    one, is refused. Strings and comments count too, because leaving them out would need PostgreSQL's own lexer. A
+#    view, a cast or a type calls functions that the text does not name. One outside the memory, which every login may
+#    use, over a volatile function with the rights of its owner, gives these rights to each query.
+#
+# The cursor returns with each row the sum of the bytes up to it, and empty values from the bound on, because one value
+# can have a gigabyte.
 
 READER = "pycrorm_reader"
 

@@ -41,9 +41,10 @@ from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.query.frames import member_of
 from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
-from pycrorm_async.query.snapshot import AnyEpisode, Moment
+from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import Block, CaseLibrary, merge
 from pycrorm_async.recall.cases import (
@@ -126,7 +127,7 @@ class Recall:
         during: AnyCase | tuple[TimeReference, TimeReference] | None = None,
         as_of: TimeReference | None = None,
         prohibit: Iterable[AnyCase] = (),
-        episode: AnyEpisode | Iterable[AnyEpisode] | None = None,
+        episode: AskedEpisode | Iterable[AskedEpisode] | None = None,
         robot: str | None = None,
         tag: str | None = None,
         simulated: bool = False,
@@ -488,7 +489,7 @@ class Conditions(NamedTuple):
     as_of: TimeReference | None = None
     prohibit: Iterable[AnyCase] = ()
     only: Mapping[str, Any] | None = None
-    episode: AnyEpisode | Iterable[AnyEpisode] | None = None
+    episode: AskedEpisode | Iterable[AskedEpisode] | None = None
     robot: str | None = None
     tag: str | None = None
     simulated: bool = False
@@ -614,7 +615,7 @@ async def _episodes(reading: Reading, conditions: Conditions) -> frozenset[int] 
     numbers, episode, tag = None, conditions.episode, conditions.tag
     if episode is not None:
         is_one = isinstance(episode, EpisodeSummary) or not isinstance(episode, list | tuple | set | frozenset)
-        several: Iterable[AnyEpisode] = [episode] if is_one else episode  # type: ignore[list-item,assignment]
+        several: Iterable[AskedEpisode] = [episode] if is_one else episode  # type: ignore[list-item,assignment]
         names = [str(each.number if isinstance(each, EpisodeSummary) else each) for each in several]
         log = await reading.log()
         numbers = frozenset([(await episode_named(log, name)).number for name in names])

@@ -39,9 +39,8 @@ from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.orm import RootFailure, TaskTreeNode
 from pycrorm_async.query.frames import TRIED, times_with
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
-from pycrorm_async.query.question import absence_of_episodes
+from pycrorm_async.query.question import AskedEpisode, absence_of_episodes
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import AnyEpisode
 from pycrorm_async.query.success import PICK_UPS, Axis, success_samples, success_table
 from pycrorm_async.recall.answer import Answer, Compared, RecalledCase, answer
 from pycrorm_async.recall.blocks import CaseLibrary, Group
@@ -85,7 +84,7 @@ class Overview(NamedTuple):
 
 async def report(
     reading: Reading,
-    episode: AnyEpisode,
+    episode: AskedEpisode,
     path: str | PathLike[str] | None = None,
     *,
     force: bool = False,
