@@ -1,7 +1,12 @@
-"""Run the command `pycrorm` as a user does: in a process of its own."""
+"""Run the command `pycrorm`: in this process, or as a user does in one of its own."""
 
+import asyncio
 import atexit
+import contextlib
+import gc
+import io
 import json
+import logging
 import multiprocessing
 import os
 import runpy
@@ -14,6 +19,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
@@ -71,13 +77,68 @@ def _run_child(connection: Connection, settings: dict[str, str], entry: Callable
     entry(connection, *args)
 
 
+_IN_PROCESS = frozenset(
+    "ask copy datasette-metadata diff episodes events export picture plot query rebuild recall report roles schema show"
+    " spool status tag verify".split()
+)
+"""The verbs that read, or write a file: they import no plan, start no process and end by themselves."""
+
+
 def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subprocess.CompletedProcess[str]:
     """Return the command's exit code, stdout and stderr.
 
-    The process is forked from one that has loaded the program and done nothing else, because loading takes a second and
-    there are hundreds of calls. Calls that start `COMMAND` show that the result is the same.
+    Verbs that read run in this process, in which everything is loaded. Others, and calls from a test that has a loop,
+    have a process that is forked from one that has loaded the program and done nothing else, because loading takes a
+    second and there are hundreds of calls. Calls that start `COMMAND` show that the result is the same.
     """
-    return _finished([str(each) for each in arguments], cwd, None, timeout_s)
+    words = [str(each) for each in arguments]
+    if _runs_in_process(words):
+        return _finished_here(words, cwd)
+    return _finished(words, cwd, None, timeout_s)
+
+
+def _runs_in_process(words: list[str]) -> bool:
+    with suppress(RuntimeError):
+        asyncio.get_running_loop()
+        return False
+    is_main = threading.current_thread() is threading.main_thread()
+    reads = bool(words) and (words[0] in _IN_PROCESS or words[:2] == ["writer", "--once"])
+    return is_main and reads and not {"--projection", "--workers"} & {*words}
+
+
+def _finished_here(words: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command in this process, and restore what it changes: streams, folder, settings, signals and logging."""
+    from pycrorm_async.cli.main import main
+
+    streams = [io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2)]
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    loggers = [logging.getLogger(each) for each in (None, "pycrorm_async", "pycrorm_async.projections")]
+    levels, root_handlers, thresholds = [each.level for each in loggers], logging.root.handlers[:], gc.get_threshold()
+    logging.root.handlers[:] = []
+    code: Any = 0
+    with (
+        contextlib.chdir(cwd),
+        mock.patch.dict(os.environ, environment(), clear=True),
+        mock.patch.object(sys, "argv", ["pycrorm", *words]),
+        mock.patch.object(sys, "stdout", streams[0]),
+        mock.patch.object(sys, "stderr", streams[1]),
+        mock.patch.object(gc, "freeze"),
+    ):
+        try:
+            main()
+        except SystemExit as leaving:
+            code = leaving.code or 0
+        finally:
+            logging.root.handlers[:] = root_handlers
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+            gc.set_threshold(*thresholds)
+    for each in streams:
+        each.seek(0)
+        each.reconfigure(errors="replace")
+    return subprocess.CompletedProcess(words, code, *(each.read() for each in streams))
 
 
 def run_script(

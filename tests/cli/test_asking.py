@@ -71,21 +71,14 @@ def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(fold
         (["root_failures", "--objekt", "milk"], "--object"),
         (["root_failures", "--limit", "many"], "'--limit': Input should be a valid integer"),
         (["longest_actions", "--status", "SUCEEDED"], "did you mean SUCCEEDED?"),
-        pytest.param(
-            ["durations", "--episode", "77"],
-            "there is no episode '77' (`pycrorm episodes` lists all 7)",
-            marks=pytest.mark.soak,
-        ),
-        pytest.param(
+        (["durations", "--episode", "77"], "there is no episode '77' (`pycrorm episodes` lists all 7)"),
+        (
             ["durations", "--episode", "00000000"],
             "7 episodes have an id that begins with '00000000': use more of its digits",
-            marks=pytest.mark.soak,
         ),
-        pytest.param(
-            ["episodes", "--since", "yesterday"], "'yesterday' is not a time: write 2026-11-23", marks=pytest.mark.soak
-        ),
-        pytest.param(["moves_of"], "missing argument 'name'", marks=pytest.mark.soak),
-        pytest.param(["experience_at", "--x", "1"], "missing option '--y'", marks=pytest.mark.soak),
+        (["episodes", "--since", "yesterday"], "'yesterday' is not a time: write 2026-11-23"),
+        (["moves_of"], "missing argument 'name'"),
+        (["experience_at", "--x", "1"], "missing option '--y'"),
     ],
 )
 def test_a_wrong_name_option_or_value_is_answered_with_one_line(words: list[str], says: str, folder: Path) -> None:
@@ -148,18 +141,10 @@ def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets(folder: Path) -
     [
         (["DELETE FROM event"], "a query may only read: it is one SELECT, or WITH … SELECT; DELETE is not allowed"),
         (["ATTACH 'planted.db' AS planted"], "ATTACH or VACUUM is not allowed"),
-        pytest.param(
-            ["SELECT * FROM root_failures"],
-            "there is no table or view root_failures; did you mean root_failure?",
-            marks=pytest.mark.soak,
-        ),
-        pytest.param(["SELECT 1; SELECT 2"], "a query is one statement: this text has several", marks=pytest.mark.soak),
-        pytest.param(
-            ["SELECT 1", "--seconds", "-1"],
-            "the limit on seconds of a query must be > 0 and finite, got -1.0",
-            marks=pytest.mark.soak,
-        ),
-        pytest.param(["SELECT 1", "--format", "xml"], "xml", marks=pytest.mark.soak),
+        (["SELECT * FROM root_failures"], "there is no table or view root_failures; did you mean root_failure?"),
+        (["SELECT 1; SELECT 2"], "a query is one statement: this text has several"),
+        (["SELECT 1", "--seconds", "-1"], "the limit on seconds of a query must be > 0 and finite, got -1.0"),
+        (["SELECT 1", "--format", "xml"], "xml"),
         (["SELECT 1", "--json", "--format", "csv"], "exclude each other"),
     ],
 )

@@ -283,7 +283,7 @@ async def test_a_server_that_is_too_old_is_one_line_and_nothing_is_made_there(
     [[version]] = ask(url, "SELECT current_setting('server_version_num')::int")
     async with proxy_before(server.folder) as proxy:
         # A real server, of which a proxy replaces only the answer with its version.
-        proxy.falsify(version.to_bytes(4), (130_011).to_bytes(4))
+        proxy.falsify(f"PostgreSQL {version // 10_000}.".encode(), b"PostgreSQL 13.")
         through = proxy.url(urlsplit(url).path.removeprefix("/"), password="s3cr")
         await asyncio.to_thread(refused, through, left_folder, "PostgreSQL 14 or newer is needed, this is 13")
         assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname IN ('pycrorm', 'memory')") == [(0,)]

@@ -97,12 +97,6 @@ def test_an_impossible_copy_is_one_line_and_makes_nothing(
     assert {path.name for path in folder.iterdir()} <= {"a.db", "a.db-wal", "a.db-shm"}
 
 
-def test_a_copy_without_a_target_is_a_usage_error(folder: Path) -> None:
-    done = pycrorm("copy", cwd=folder)
-    assert done.returncode == 2
-    assert "--to" in done.stderr
-
-
 async def test_two_memories_that_contradict_each_other_are_reported_and_the_rest_is_copied(folder: Path) -> None:
     other = f"sqlite:///{folder}/b.db"
     await append_and_fold(other, [hand_written(1).records[0]._replace(monotonic_ns=6)], folded=False)
@@ -164,11 +158,3 @@ def test_a_copy_is_interrupted_at_once_and_the_next_one_takes_the_rest(tmp_path:
     [done] = answer("copy", "--to", target, cwd=tmp_path)["episodes"]
     assert (done["were_there"], done["copied"], done["head"]) == (500, 1_500, 2_000)
     assert logs_of(target) == logs_of(source)
-
-
-def test_events_in_the_spool_beside_the_source_are_reported(folder: Path) -> None:
-    (folder / "notes.py").write_text(PLAN)
-    assert pycrorm("run", "notes.py", "--writer", "daemon", "--url", "sqlite:///a.db", cwd=folder).returncode == 0
-    done = pycrorm("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder)
-    assert done.returncode == 0
-    assert one_line_of(done).startswith("1 dead recorder left events that are not in the database: run `pycrorm writer")

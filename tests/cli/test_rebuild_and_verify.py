@@ -30,7 +30,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import COMMAND, NOTES_PLAN, answer, environment, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change, change_each
-from tests.projections.event_script import append_and_fold, declarations, declared
+from tests.projections.event_script import append_and_fold
 from tests.projections.rebuild_cases import TYPES, parking, picking, str_of, traces
 from tests.projections.verify_cases import fold_in_batches, full, opened, visible_tables
 from tests.store.factories import declaration
@@ -123,19 +123,6 @@ def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) 
     assert lines[20] == f"and {count - 20} more"
     document = answer("verify", cwd=folder, code=1)
     assert (document["drift"], len(document["differences"])) == (count, min(count, 100))
-
-
-@pytest.mark.soak_on("postgresql")
-async def test_a_type_without_tables_exits_with_1(folder: Path) -> None:
-    url = f"sqlite:///{folder}/pycrorm.db"
-    ask_to_change(url, "CREATE TABLE walk_action (mine TEXT)")
-    log = await opened(url)
-    await fold_records(log, [*declarations(declared("WalkAction", "walk_action")), *full(4).records])
-    await log.close()
-    done = pycrorm("verify", cwd=folder)
-    assert (done.returncode, done.stderr) == (1, "")
-    assert done.stdout.startswith("no tables: 'WalkAction': ")
-    assert done.stdout.endswith("0 episodes are stopped, 1 types have no tables, no other problem\n")
 
 
 @pytest.mark.soak_on("postgresql")
@@ -301,13 +288,6 @@ def test_verify_and_rebuild_name_the_events_that_wait_in_the_spool(tmp_path: Pat
     assert answer(verb, cwd=tmp_path)["episodes"] == 1
 
 
-@pytest.mark.parametrize("verb", ["verify", "rebuild"])
-def test_a_temporary_database_is_refused_in_one_line(tmp_path: Path, verb: str) -> None:
-    done = pycrorm(verb, "--url", "sqlite://", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "pycrorm: sqlite:// exists only in its own process, no other can open it: name a file\n"
-
-
 # === rebuild ==================================================================================================
 #
 # `pycrorm rebuild` as an operator runs it: in a process of its own without the code of the plan.
@@ -352,22 +332,6 @@ def test_an_episode_that_cannot_be_folded_is_reported_and_is_a_problem(tmp_path:
     done = pycrorm("rebuild", cwd=tmp_path)
     assert done.returncode == 1
     assert one_line_of(done).startswith(f"episode {str_of(2)} is parked: event 3: ")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "line"),
-    [
-        (["--url", "sqlite:///none.db"], 3, "none.db does not exist"),
-        (["--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
-        (["--url", "sqlite:///text.db"], 3, "is not a database"),
-    ],
-)
-def test_bad_input_is_one_line(tmp_path: Path, arguments: Sequence[str], code: int, line: str) -> None:
-    (tmp_path / "text.db").write_text("no database at all, " * 100)
-    done = pycrorm("rebuild", *arguments, cwd=tmp_path)
-    assert done.returncode == code
-    assert line in one_line_of(done)
-    assert [each.name for each in tmp_path.iterdir()] == ["text.db"]
 
 
 async def test_a_second_rebuild_is_refused_with_one_line(database_url: str, tmp_path: Path) -> None:

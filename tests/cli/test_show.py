@@ -111,7 +111,7 @@ def test_a_moment_is_drawn_with_its_tree_and_its_world(ridden: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     lines = [line.rstrip() for line in done.stdout.splitlines()]
     assert lines[0] == "Episode 1: Take the milk for a ride."
-    assert lines[4].startswith("  at        #9: after event 9, 0.")
+    assert lines[4].startswith("  at        #9: after event 9, ")
     assert lines[5:8] == [
         "  status    RUNNING",
         "  running   NavigateAction > MoveMotion",
@@ -377,10 +377,6 @@ async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_pat
         (["0000"], 2, "2 episodes have an id that begins with '0000': use more of its digits"),
         (["9" * 5000], 2, "there is no episode"),
         (["1", "--type", "nodestarted"], 2, "unknown event type 'nodestarted'; known types: DescriptionDeclared, "),
-        (["1", "--url", "sqlite:///none.db"], 3, "does not exist"),
-        (["1", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
-        (["1", "--url", "oracle://lab/memory"], 2, "oracle:// is not a supported database"),
-        (["1", "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory"], 3, "cannot be reached: Connection refused"),
     ],
 )
 async def test_an_impossible_request_is_one_line(tmp_path: Path, arguments: list[str], code: int, reason: str) -> None:
@@ -389,4 +385,3 @@ async def test_an_impossible_request_is_one_line(tmp_path: Path, arguments: list
     done = pycrorm("events", *arguments, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (code, "")
     assert reason in one_line_of(done)
-    assert "s3cr" not in done.stderr

@@ -173,30 +173,6 @@ def test_status_reports_stopped_episodes_and_how_far_the_tables_are_behind(folde
     assert one_line_of(done).endswith("is stopped: a column is in the way")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "line"),
-    [
-        (["writer", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
-        (["status", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
-        (["run", "notes.py", "--url", "sqlite://", "--writer", "daemon"], 2, "no daemon can write it"),
-        (["writer", "--url", "sqlite:////proc/none/x.db", "--spool", "s"], 3, "/proc/none"),
-        (["status", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),
-    ],
-)
-def test_bad_input_is_one_line(folder: Path, arguments: list[str], code: int, line: str) -> None:
-    done = pycrorm(*arguments, cwd=folder)
-    assert done.returncode == code
-    assert line in one_line_of(done)
-
-
-def test_no_verb_shows_a_password(folder: Path) -> None:
-    url = "postgresql://robot:topsecret@127.0.0.1:1/memory?passfile=topsecret"
-    for verb in ("episodes", "status", "writer", "demo"):
-        done = pycrorm(verb, "--url", url, "--spool", "s", cwd=folder)
-        assert done.returncode == 3
-        assert "topsecret" not in done.stdout + done.stderr
-
-
 # === drain once ===============================================================================================
 #
 # The exit code of `pycrorm writer --once`: 1 if the database refused anything, with and without --json.

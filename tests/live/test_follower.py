@@ -2,9 +2,8 @@
 
 import asyncio
 import shutil
-import sqlite3
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, closing, suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import msgspec
@@ -20,7 +19,7 @@ from pycrorm_async.report import document as episode_fold
 from pycrorm_async.report.write import newest_episodes, overview_document
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Pose
-from tests.databases import put_memory
+from tests.databases import ask, ask_to_change, put_memory
 from tests.live.conftest import robot_in
 
 
@@ -156,12 +155,10 @@ async def test_an_event_that_cannot_be_read_is_a_fault_of_the_feed_behind_what_w
         for key in "ab":
             robot.start(key)
             robot.end(key)
-    with closing(sqlite3.connect(tmp_path / "pycrorm.db")) as database, database:
-        for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
-            database.execute(f"DROP TRIGGER {trigger}")
-        starts = "SELECT sequence FROM event WHERE type = 'NodeStarted' ORDER BY sequence"
-        _root, _first, (second,) = database.execute(starts)
-        database.execute("UPDATE event SET payload = '{' WHERE sequence = ?", (second,))
+    url = url_of(tmp_path)
+    _root, _first, (second,) = ask(url, "SELECT sequence FROM event WHERE type = 'NodeStarted' ORDER BY sequence")
+    ask_to_change(url, "DROP TRIGGER event_is_not_updated")
+    ask_to_change(url, f"UPDATE event SET payload = '{{' WHERE sequence = {second}")
     follower = LogFollower(DatabaseAddress.parse(url_of(tmp_path)))
     feed = await follower.feed("1")
     assert feed.fault is not None

@@ -136,17 +136,6 @@ def whole(spool: Path, crafted: FolderWriter) -> FolderWriter:
     return author
 
 
-async def test_one_round_drains_the_next_folder(
-    database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter
-) -> None:
-    report = await recover(database_url, spool=spool)
-    [(name, fault)] = report.failed.items()
-    assert isinstance(fault, SpoolDamaged)
-    assert (name, fault.path, fault.offset) == (crafted.folder.name, crafted.segments[0], crafted.places[0][1])
-    assert ask(database_url, STORED_EVENTS) == [(2,)]
-    assert [each.path for each in Spool(spool).recorders()] == [crafted.folder]
-
-
 async def test_the_daemon_drains_the_next_folder(
     database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter
 ) -> None:
@@ -155,16 +144,6 @@ async def test_the_daemon_drains_the_next_folder(
     await running.wait_for_line(f"{whole.folder.name} is recovered")
     await running.stop()
     assert ask(database_url, STORED_EVENTS) == [(2,)]
-
-
-async def test_a_new_plan_adopts_the_next_folder(
-    database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter, caplog: pytest.LogCaptureFixture
-) -> None:
-    async with Memory.open(database_url, spool=spool, settings=QUICKLY_SYNCED) as memory:
-        await NoteActionPerformable("beside").perform()
-        await until(lambda: not whole.folder.exists())
-        assert memory.status.unadopted.keys() == {crafted.folder.name}
-    assert len([each for each in caplog.records if each.levelno >= logging.WARNING]) == 1
 
 
 def test_every_verb_reports_it_in_one_line(

@@ -19,10 +19,7 @@ from pycrorm_async.errors import (
     DatabaseUnavailable,
     EpisodeParked,
     FlushTimeout,
-    SpoolForeign,
-    SpoolUnavailable,
 )
-from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.sources import LiveSource
@@ -294,18 +291,6 @@ async def test_a_daemon_ends_when_its_database_file_is_replaced_and_waits_when_t
     assert report.failed == {}
 
 
-async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(
-    database_url: str, spool: Path, daemon: Start
-) -> None:
-    async with daemon() as started:
-        await started.wait_for_line("draining")
-        with pytest.raises(SpoolUnavailable, match="another `pycrorm writer` drains it already") as refused:
-            await serve(database_url, spool=spool, stop=asyncio.Event(), report=print)
-        assert "\n" not in str(refused.value)
-    async with daemon() as started:
-        await started.wait_for_line("draining")
-
-
 async def test_a_daemon_that_is_cancelled_during_a_scan_leaves_the_folders_to_the_next(
     database_url: str, spool: Path, daemon: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -332,41 +317,6 @@ async def test_a_daemon_that_is_cancelled_during_a_scan_leaves_the_folders_to_th
         async with daemon():
             await memory.flush()
             assert await texts(memory) == ["a"]
-
-
-async def test_a_spool_of_another_database_is_refused_and_left_unchanged(
-    database_url: str, spool: Path, tmp_path: Path
-) -> None:
-    async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.1)):
-        await NoteActionPerformable("a").perform()
-        await recover(database_url, spool=spool)
-        await NoteActionPerformable("b").perform()
-        async with Memory.open(f"sqlite:///{tmp_path}/other.db"):
-            pass
-        with pytest.raises(SpoolForeign, match="belongs to log"):
-            await serve(f"sqlite:///{tmp_path}/other.db", spool=spool, stop=asyncio.Event(), report=print)
-        await recover(database_url, spool=spool)
-    assert ask(f"sqlite:///{tmp_path}/other.db", "SELECT count(*) FROM event") == [(0,)]
-
-
-async def test_damage_in_one_folder_is_reported_and_the_others_are_drained(
-    database_url: str, spool: Path, daemon: Start
-) -> None:
-    for text in ("damaged", "whole"):
-        async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.1)) as memory:
-            await NoteActionPerformable(text).perform()
-    first, second = Spool(spool).recorders()
-    segment = first.path / "00000001.segment"
-    content = bytearray(segment.read_bytes())
-    content[content.index(b"damaged")] ^= 1
-    segment.write_bytes(content)
-    async with daemon() as started:
-        await started.wait_for_line(f"{first.name}: .*00000001.segment is damaged at byte .*; retrying")
-        await started.wait_for_line(f"{second.name} is recovered")
-    async with Reading.open(database_url) as reading:
-        assert await texts(reading) == ["whole"]
-    assert [each.name for each in Spool(spool).recorders()] == [first.name]
-    assert memory.is_open is False
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, recover
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked, LogDamaged, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked, LogDamaged
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, episode_text
 from pycrorm_async.operations import copy as operation
 from pycrorm_async.operations.copy import copy_episodes, tag_episode
@@ -266,13 +266,6 @@ def test_the_command_tags_lists_and_names_what_it_cannot_do(tmp_path: Path) -> N
     done = pycrorm("tag", "9", "good", cwd=tmp_path)
     assert (done.returncode, "there is no episode '9'" in one_line_of(done)) == (2, True)
     assert pycrorm("verify", cwd=tmp_path).returncode == 0
-
-
-@pytest.mark.slow
-async def test_an_unknown_episode_cannot_be_tagged(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
-        with pytest.raises(UnknownEpisode):
-            await memory.tag("last", "good")
 
 
 @pytest.mark.slow

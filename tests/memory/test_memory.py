@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import os
 import sqlite3
-import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -36,7 +34,7 @@ from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.task_status import TaskStatus
-from tests.commands import answer, environment
+from tests.commands import answer
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
@@ -111,17 +109,6 @@ async def test_a_cancelled_node_has_the_status_cancelled(tmp_path: Path) -> None
             node = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.dtype == "WaitAction"))).one()
             assert node.status == TaskStatus.CANCELLED
             assert node.reason == "CancelledError"
-
-
-async def test_importing_the_package_loads_no_optional_library() -> None:
-    script = (
-        "import sys, pycrorm_async; print([name for name in sys.modules if 'sqlalchemy' in name or 'bullet' in name])"
-    )
-    done = await asyncio.to_thread(
-        subprocess.run, [sys.executable, "-c", script], env=environment(), capture_output=True, text=True, check=False
-    )
-    assert done.stdout == "[]\n", done.stderr
-    assert os.environ.get("PYCRORM_URL") is None
 
 
 # === refusals =================================================================================================
@@ -277,19 +264,6 @@ async def test_an_attribute_of_a_memory_that_is_not_open_raises_attribute_error(
     ):
         with pytest.raises(CallerError, match=r"async with Memory\.open"):
             use()
-
-
-@pytest.mark.slow
-async def test_a_parked_episode_is_reported_once(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with sqlite3.connect(tmp_path / "memory.db") as plain:
-            plain.execute("CREATE TABLE note_action (mine TEXT)")
-        plain.close()
-        await NoteActionPerformable("a").perform()
-        with pytest.raises(EpisodeParked):
-            await memory.flush()
-        await memory.flush()
-        assert memory.status.faults.total == 0
 
 
 @pytest.mark.slow

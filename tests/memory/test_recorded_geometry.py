@@ -342,33 +342,6 @@ async def test_one_robot_has_one_hash_wherever_it_is_and_however_its_meshes_are_
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_a_mesh_that_changed_between_two_runs_has_two_hashes_and_both_are_kept(
-    database_url: str, tmp_path: Path
-) -> None:
-    heights = []
-    for height in (3.0, 5.0):
-        robot = made_arm(tmp_path, height)
-        os.utime(tmp_path / "meshes" / "wedge.obj", (height, height))
-        await recorded(database_url, robot, Settings())
-    async with Reading.open(database_url) as reading:
-        for episode in ("1", "2"):
-            with world_of(await reading.as_of(episode, sequence=3)) as world:
-                box = world.object("arm").box_in_link("tip")
-                assert box is not None
-                heights.append(box.size.z)
-        async with reading.session() as session:
-            descriptions = (await session.scalars(select(ObjectDescription))).all()
-            arms = [each for each in descriptions if each.meshes]
-            assert len(descriptions) == 3  # two arms and one milk
-            assert len({mesh.sha256 for each in arms for mesh in each.meshes}) == 2
-            rows = (
-                await session.scalars(select(ObjectRow).where(ObjectRow.name == "arm").order_by(ObjectRow.id))
-            ).all()
-            assert {row.description_fingerprint for row in rows} == {each.fingerprint for each in arms}
-    assert heights == pytest.approx([0.3, 0.5], abs=1e-6)
-
-
-@pytest.mark.soak_on("postgresql")
 async def test_a_mesh_that_changes_in_one_process_is_hashed_again(database_url: str, tmp_path: Path) -> None:
     robot = made_arm(tmp_path)
     async with Memory.open(database_url) as memory:

@@ -21,25 +21,6 @@ from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 pytestmark = pytest.mark.slow
 
 
-async def test_a_memory_continues_after_an_earlier_one_ended(tmp_path: Path) -> None:
-    for text in ("one", "two", "three"):
-        async with Memory.open(url_of(tmp_path)):
-            await NoteActionPerformable(text).perform()
-    async with Reading.open(url_of(tmp_path)) as reading:
-        assert await texts(reading) == ["one", "two", "three"]
-        assert [each.number for each in await reading.episodes()] == [1, 2, 3]
-
-
-async def test_recording_ends_with_the_memory(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)):
-        await NoteActionPerformable("inside").perform()
-    assert recorder.get() is None
-    assert watcher.get() is None
-    await NoteActionPerformable("outside").perform()
-    async with Reading.open(url_of(tmp_path)) as reading:
-        assert await texts(reading) == ["inside"]
-
-
 async def test_a_perform_is_recorded_by_the_memory_whose_episode_is_open(tmp_path: Path) -> None:
     first, second = f"sqlite:///{tmp_path}/1.db", f"sqlite:///{tmp_path}/2.db"
     async with Memory.open(first) as one, Memory.open(second) as two:
@@ -51,18 +32,6 @@ async def test_a_perform_is_recorded_by_the_memory_whose_episode_is_open(tmp_pat
         await two.flush()
         assert await texts(one) == ["to the one with the episode"]
         assert await texts(two) == ["to the last opened", "to the last opened again"]
-
-
-async def test_a_memory_closed_inside_an_episode_ends_it_as_interrupted(tmp_path: Path) -> None:
-    memory = Memory.open(url_of(tmp_path))
-    await memory.__aenter__()
-    opened = memory.episode(description="e")
-    await opened.__aenter__()
-    await NoteActionPerformable("a").perform()
-    await memory.__aexit__(None, None, None)
-    await opened.__aexit__(None, None, None)
-    async with Reading.open(url_of(tmp_path)) as reading:
-        assert [each.status for each in await reading.episodes()] == ["INTERRUPTED"]
 
 
 async def test_the_next_memory_adopts_the_folder_of_a_killed_process(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,6 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.events.types import EpisodeStatus, NodeStatus
 from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.memory import SyncMemory
-from pycrorm_async.projections.columns import SCHEMA
 from pycrorm_async.query.success import Samples, Values, interval_95, success_figure
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.report.write import newest_episodes, outcomes_of, overview_document
@@ -242,20 +240,3 @@ def test_a_failure_and_a_success_at_one_place_are_both_drawn() -> None:
     red, blue = picture[..., 0] - picture[..., 2], picture[..., 2] - picture[..., 0]
     assert (red > 100).sum() > 20
     assert (blue > 100).sum() > 20
-
-
-def test_no_two_columns_of_a_view_have_the_same_comment_but_the_parts_of_one_vector() -> None:
-    for view, texts in SCHEMA.comments.items():
-        names: dict[str, list[str]] = {}
-        for column, text in texts.items():
-            names.setdefault(text, []).append(column)
-        for alike in names.values():
-            parts = {each.removeprefix(each.rstrip("xyzw").removesuffix("q")).removeprefix("q") for each in alike}
-            assert len(alike) == 1 or (parts <= set("xyzw") and len(parts) == len(alike)), (view, alike)
-
-
-def test_the_columns_of_the_robot_in_the_frame_of_the_object_say_so() -> None:
-    texts = SCHEMA.comments["PickUpWithContextView"]
-    robot = [name for name, text in texts.items() if "robot's base in the object's own frame" in text]
-    assert robot == [f"robot_in_object_{each}" for each in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    assert json.dumps(texts["object_x"]).count("robot_in_object_x") == 1

@@ -74,7 +74,8 @@ def test_a_question_reads_no_table_of_nodes_or_poses_as_a_whole(database_url: st
             ask_to_change(url, "ANALYZE")
         async with Reading.open(url) as reading:
             questions = {name: getattr(reading.ask, name) for name in QUESTIONS}
-            named = {name: {"name": "milk"} for name in ("object_history", "moves_of")}
+            named: dict[str, dict[str, Any]] = {name: {"name": "milk"} for name in ("object_history", "moves_of")}
+            named["experience_at"] = {"x": 0.5, "y": 0.5}
             about_all = {
                 name: question(**named.get(name, {}))
                 for name, question in questions.items()
@@ -83,12 +84,11 @@ def test_a_question_reads_no_table_of_nodes_or_poses_as_a_whole(database_url: st
             about_one = {
                 f"{name} of an episode": question(**named.get(name, {}), episode=1)
                 for name, question in questions.items()
-                if name not in ("episodes", "experience_at")
             }
             return [{name: each.sql for name, each in {**about_all, **about_one}.items()}]
 
     [statements] = run_in_own_loop(asked())
-    assert len(statements) == 5 + 10
+    assert len(statements) == 5 + 12
     explain = "EXPLAIN" if on_server else "EXPLAIN QUERY PLAN"
     plans = dict(zip(statements, ask_each(url, [f"{explain} {each}" for each in statements.values()]), strict=True))
     scans = {name: [step for *_, step in plan if _WHOLE_TABLE.search(step)] for name, plan in plans.items()}

@@ -328,7 +328,6 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "moves_of": {"name": "milk"},
     "experience_at": {"x": 0.0, "y": 0.0},
 }
-OF_EPISODES = [each for each in QUESTIONS if each not in ("experience_at", "episodes")]
 
 
 @pytest.mark.soak_on("postgresql")
@@ -336,17 +335,15 @@ async def test_the_sql_of_each_question_returns_its_rows(reading: Reading, fille
     identity = (await reading.episode("3")).id
     questions = [getattr(reading.ask, name)(**ARGUMENTS.get(name, {})) for name in QUESTIONS]
     for episode in (3, identity, "last"):
-        questions += [getattr(reading.ask, name)(**ARGUMENTS.get(name, {}), episode=episode) for name in OF_EPISODES]
+        questions += [getattr(reading.ask, name)(**ARGUMENTS.get(name, {}), episode=episode) for name in QUESTIONS]
     texts = [each.sql for each in questions]  # compiled at each access
     by_hand = ask_each(filled_url, texts)
     for each, text, rows in zip(questions, texts, by_hand, strict=True):
         assert len(rows) == len(await each.rows()), text
         assert str(each) == text
-    of_three, of_identity, of_last = (
-        by_hand[len(QUESTIONS) + start * len(OF_EPISODES) :][: len(OF_EPISODES)] for start in range(3)
-    )
+    of_three, of_identity, of_last = (by_hand[start * len(QUESTIONS) :][: len(QUESTIONS)] for start in range(1, 4))
     assert of_three == of_identity
-    durations = OF_EPISODES.index("durations")
+    durations = [*QUESTIONS].index("durations")
     assert of_identity[durations] != of_last[durations]
 
 
@@ -393,26 +390,6 @@ async def test_a_question_to_an_empty_memory_has_no_rows(database_url: str) -> N
             question = getattr(reading.ask, name)(**ARGUMENTS.get(name, {}))
             assert await question.rows() == []
             assert (await question).empty
-
-
-async def test_the_plan_of_each_question_about_an_episode_uses_an_index(reading: Reading, filled_url: str) -> None:
-    """The memory is small: the server is kept from reading a whole table because it is small."""
-    names = [each for each in QUESTIONS if each != "episodes"]
-    statements = [
-        getattr(reading.ask, name)(**ARGUMENTS.get(name, {}), **({"episode": 3} if name in OF_EPISODES else {})).sql
-        for name in names
-    ]
-    if filled_url.startswith("sqlite"):
-        plans = ask_each(filled_url, [f"EXPLAIN QUERY PLAN {each}" for each in statements])
-    else:
-        plans = ask_each(filled_url, ["SET enable_seqscan = off", *(f"EXPLAIN {each}" for each in statements)])[1:]
-    for name, plan in zip(names, plans, strict=True):
-        steps = [str(step[-1]) for step in plan]
-        of_tables = [each for each in steps if each.startswith("SCAN zz_") or "Seq Scan on zz_" in each]
-        scans = [each for each in of_tables if "INDEX" not in each and "simulated_episode" not in each]
-        # The places of robots have no index: a question about a place reads the actions and looks up each pose.
-        assert len(scans) <= (name == "experience_at"), "\n".join(steps)
-        assert any("INDEX" in each.upper() for each in steps), "\n".join(steps)
 
 
 @pytest.mark.soak_on("postgresql")

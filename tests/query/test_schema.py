@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -46,11 +45,6 @@ def test_every_column_of_a_time_has_its_unit_and_every_built_in_view_a_sentence(
                 assert views[name].columns[column.name].endswith("µs since 1970-01-01 00:00 UTC"), (name, column.name)
             if column.name.endswith("_ns"):
                 assert views[name].columns[column.name].startswith("ns of"), (name, column.name)
-
-
-def test_texts_of_columns_are_about_values_and_not_about_python() -> None:
-    texts = [text for view in described().values() for text in view.columns.values()]
-    assert not [each for each in texts if re.search(r"await|undefer|selectinload|\bNone\b", each)]
 
 
 async def test_a_memory_describes_all_of_its_views(reading: Reading) -> None:
