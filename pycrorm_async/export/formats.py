@@ -1,6 +1,6 @@
 """Define the formats of exports, and write rows as Parquet, CSV or JSON lines.
 
-A package adds a format with an entry point in the group `pycrorm_async.export_formats`, whose name is that of the
+A package adds a format with an entry point in the group `pycrorm.export_formats`, whose name is that of the
 format and the suffix of its files, and whose value is a `Format`.
 """
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from pycrorm_async.progress_bar import ProgressCallback
 
-GROUP = "pycrorm_async.export_formats"
+GROUP = "pycrorm.export_formats"
 """The group of the entry points of formats."""
 
 

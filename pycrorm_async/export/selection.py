@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import Enum
@@ -23,7 +24,7 @@ from sqlalchemy.orm import Mapper
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import Base, Designator, ProcessMetaData, TaskTreeNode
-from pycrorm_async.orm.base import EPISODE, same_row
+from pycrorm_async.orm.base import EPISODE, same_row, view_mappers
 from pycrorm_async.query.frames import of_episode
 from pycrorm_async.query.question import Question, episode_name
 from pycrorm_async.query.questions import QUESTIONS
@@ -74,7 +75,8 @@ class Selection:
 
 class _Covered(NamedTuple):
     episodes: tuple[CoveredEpisode, ...]
-    simulated: bool
+    simulated: bool = False
+    left_out: int = 0
 
 
 async def select_rows(
@@ -98,8 +100,7 @@ async def select_rows(
     if isinstance(what, Select):
         if chosen:
             raise CallerError("a select of your own chooses its episodes itself: add a condition to it")
-        covered, left_out = await _complete(reading)
-        return Selection("select", "", what, covered, left_out=left_out)
+        return Selection("select", "", what, *await _covered(reading, ()))
     if isinstance(what, Question):
         return await _asked(reading, "select", what, {}, chosen)
     if isinstance(what, type):
@@ -130,7 +131,7 @@ async def select_rows(
         .where(of_episode(node.process_metadata_id, _numbers(of_names.episodes)))
         .order_by(node.id)
     )
-    return Selection("episodes", "", statement, of_names.episodes, of_names.simulated)
+    return Selection("episodes", "", statement, *of_names)
 
 
 def _question(reading: Reading, name: str, arguments: Mapping[str, Any]) -> Question:
@@ -169,14 +170,11 @@ async def _asked(
                 "the question has the argument `episode`, which chooses it already: leave one of both out"
             )
         chosen = [episode_name(question.episode)]
-    if chosen:
-        covered, simulated, left_out = *await _named(reading, chosen), 0
-    else:
-        (covered, left_out), simulated = await _complete(reading), False
+    covered = await _covered(reading, chosen)
     if recorded.get("episode") is not None:
-        recorded["episode"] = covered[0].id  # later, `last` and a number may be of another episode
-    statement = question.select_among(_numbers(covered))
-    return Selection(kind, question.name, statement, covered, simulated, left_out, recorded, question)
+        recorded["episode"] = covered.episodes[0].id  # later, `last` and a number may be of another episode
+    statement = question.select_among(_numbers(covered.episodes))
+    return Selection(kind, question.name, statement, *covered, recorded, question)
 
 
 async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen: Sequence[str]) -> Selection:
@@ -197,13 +195,8 @@ async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen:
         if chosen:
             raise CallerError(f"the rows of {name} are of no episode: export all of them")
         return Selection("view", name, statement, ())
-    if chosen:
-        of_names = await _named(reading, chosen)
-        condition = of_episode(episode, _numbers(of_names.episodes))
-        return Selection("view", name, statement.where(condition), of_names.episodes, of_names.simulated)
-    covered, left_out = await _complete(reading)
-    condition = of_episode(episode, _numbers(covered))
-    return Selection("view", name, statement.where(condition), covered, left_out=left_out)
+    covered = await _covered(reading, chosen)
+    return Selection("view", name, statement.where(of_episode(episode, _numbers(covered.episodes))), *covered)
 
 
 async def _views(reading: Reading) -> dict[str, Mapper[Any] | None]:
@@ -211,21 +204,19 @@ async def _views(reading: Reading) -> dict[str, Mapper[Any] | None]:
     log = await reading.log()
     async with log.reading() as connection:
         names = await connection.run_sync(lambda each: inspect(each).get_view_names())
-    mappers: dict[str, Mapper[Any] | None] = dict.fromkeys(names)
-    built_in = {each.local_table.description: each for each in Base.registry.mappers}
-    for name in names:
-        mapper = built_in.get(name)
-        if mapper is None:
-            try:
-                mapper = inspect(reading.mapped(name))
-            except CallerError:
-                continue
-        mappers[name] = mappers[mapper.class_.__name__] = mapper
-    return mappers
+    mappers: dict[str, Mapper[Any] | None] = dict.fromkeys(names) | view_mappers()
+    for name in [each for each in names if mappers[each] is None]:
+        with suppress(CallerError):
+            mappers[name] = inspect(reading.mapped(name))
+    present = [each for each in (*mappers.values(), *Base.registry.mappers) if each is not None]
+    of_classes = {each.class_.__name__: each for each in present if each.local_table.description in names}
+    return {name: mappers[name] for name in names} | of_classes
 
 
-async def _complete(reading: Reading) -> tuple[tuple[CoveredEpisode, ...], int]:
-    """Return the episodes that have ended and are in the tables to their last event; and the number of others."""
+async def _covered(reading: Reading, chosen: Sequence[str]) -> _Covered:
+    """Return the chosen episodes; without any, those that have ended and are in the tables to their last event."""
+    if chosen:
+        return await _named(reading, chosen)
     log = await reading.log()
     rows = {each.number: each for each in await log.episodes() if each.head}
     episode = ProcessMetaData
@@ -236,7 +227,7 @@ async def _complete(reading: Reading) -> tuple[tuple[CoveredEpisode, ...], int]:
         for number, status in statuses
         if number in rows and rows[number].ended_wall_ns is not None and rows[number].folded == rows[number].head
     }
-    return await covered_episodes(reading, ended), len(statuses) - len(ended)
+    return _Covered(await covered_episodes(reading, ended), left_out=len(statuses) - len(ended))
 
 
 async def _named(reading: Reading, names: Iterable[str], *, running: bool = False) -> _Covered:

@@ -289,6 +289,16 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
             return None
 
 
+def view_mappers() -> dict[str, Mapper[Any]]:
+    """Return the mappers of this process by view; of the classes that share a view, that of their base."""
+    own = [
+        each
+        for each in Base.registry.mappers
+        if each.inherits is None or each.local_table is not each.inherits.local_table
+    ]
+    return {str(each.local_table.description): each for each in own}
+
+
 class RowOfEvent:
     """A row whose id, the attribute named by `_row`, contains the sequence of the row's event."""
 

@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import Table
 
-from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment, is_built_in
+from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment, is_built_in, view_mappers
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion
 from pycrorm_async.projections.columns import INDEXED, SCHEMA_FILE, Schema, Storage
 from pycrorm_async.projections.mapped_tables import column_storage, leaves_of
@@ -82,12 +82,7 @@ class ViewDescription:
 
 def described() -> dict[str, ViewDescription]:
     """Return the description of every mapped view of this process, by name."""
-    views: dict[str, ViewDescription] = {}
-    for mapper in sorted(Base.registry.mappers, key=lambda each: str(each.class_.__name__)):
-        if mapper.inherits is None or mapper.local_table is not mapper.inherits.local_table:  # else it shares a view
-            description = describe(mapper.class_)
-            views[description.name] = description
-    return dict(sorted(views.items()))
+    return {name: describe(mapper.class_) for name, mapper in sorted(view_mappers().items())}
 
 
 def describe(class_: Any) -> ViewDescription:
@@ -118,8 +113,8 @@ def describe(class_: Any) -> ViewDescription:
 
 def unit_of(column: Any) -> str:
     """Return the unit of a column of a mapped class, such as m; empty if it has none or none is known."""
-    mappers = Base.registry.mappers
-    class_ = next((each.class_ for each in mappers if each.local_table is getattr(column, "table", None)), None)
+    mapped = (each.class_ for each in view_mappers().values() if each.local_table is getattr(column, "table", None))
+    class_ = next(mapped, None)
     unit = None if class_ is None else _UNIT.search(describe(class_).columns.get(column.name, ""))
     return "" if unit is None else unit[1]
 
@@ -199,8 +194,7 @@ def schema() -> Schema:
 
 def _columns_of(table: str) -> dict[str, Storage]:
     """Return the columns of a table: those of the class and of those that share its view, as their `info` has them."""
-    roots = (each.class_ for each in Base.registry.mappers if each.inherits is None)
-    [class_] = (each for each in roots if each.__table__.name == table)
+    class_: Any = view_mappers()[table].class_
     storages = {each.name: _storage_of(each) for each in class_.__table__.columns}
     places = {each.name: each.info["after"] for each in class_.__table__.columns if "after" in each.info}
     for name, info in class_._unmapped.items():  # noqa: SLF001  of our own base class

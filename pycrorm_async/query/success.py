@@ -18,7 +18,7 @@ from sqlalchemy.orm import DeclarativeBase
 
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm import Designator
-from pycrorm_async.orm.base import EPISODE, Base, is_built_in
+from pycrorm_async.orm.base import EPISODE, Base, is_built_in, view_mappers
 from pycrorm_async.orm.documentation import unit_of
 from pycrorm_async.query.frames import NORMAL_95, TRIED, FrameColumn, columns_of
 from pycrorm_async.query.reading import Reading
@@ -329,11 +329,8 @@ async def _statement(reading: Reading, connection: AsyncConnection, of: Source) 
         return "the select", of
     if not isinstance(of, str):
         return of.__name__, select(of)
-    mapped: dict[str, Any] = {}
-    for mapper in sorted(Base.registry.mappers, key=lambda each: len(each.class_.__mro__)):
-        if is_built_in(mapper.class_):  # of the classes that share a view, the first one is their base
-            mapped[mapper.class_.__name__] = mapper.class_
-            mapped.setdefault(str(mapper.class_.__table__.name), mapper.class_)
+    by_name = view_mappers() | {each.class_.__name__: each for each in Base.registry.mappers}
+    mapped: dict[str, Any] = {name: each.class_ for name, each in by_name.items() if is_built_in(each.class_)}
     if of in mapped:
         return of, select(mapped[of])
     names = await connection.run_sync(lambda sync: inspect(sync).get_view_names())

@@ -33,7 +33,7 @@ from pycrorm_async.export import export as export_module
 from pycrorm_async.export.export import FORMATS, datasette_metadata, export, export_again
 from pycrorm_async.export.formats import CSV, GROUP, Format, Job, Written, _write_rows
 from pycrorm_async.export.selection import read_manifest
-from pycrorm_async.orm import PickUpWithContextView, RootFailure, TaskTreeNode
+from pycrorm_async.orm import Object, PickUpWithContextView, RootFailure, TaskTreeNode
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.world.pose import Arms
 from tests.commands import one_line_of, pycrorm
@@ -115,6 +115,8 @@ async def test_bytes_are_base64_in_files_of_text(either: Reading, tmp_path: Path
 async def test_a_view_of_a_user_and_a_select_are_exported(reading: Reading, tmp_path: Path) -> None:
     assert (await export(reading, "longest", tmp_path / "longest.csv")).rows > 5
     assert [*pd.read_csv(tmp_path / "longest.csv")] == ["dtype", "s"]
+    moments = len(await reading.dataframe(Object))  # three further classes share its view
+    assert (await export(reading, "object", tmp_path / "objects.csv")).rows == moments > 0
     await export(reading, "concept", tmp_path / "concepts.parquet")
     assert {"name", "parent"} <= {*parquet.read_schema(tmp_path / "concepts.parquet").names}
 
