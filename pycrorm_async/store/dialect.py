@@ -307,7 +307,7 @@ class Dialect(ABC):
         """Return the reason why the database can never create such a table or view; None for a temporary error."""
 
     @abstractmethod
-    def translate_error(self, error: Exception, name: str) -> PycrormError:
+    def translate_error(self, error: Exception, database: str) -> PycrormError:
         """Return the error of this package to raise instead."""
 
     @contextmanager

@@ -50,7 +50,6 @@ from pycrorm_async.errors import (
     DatabaseError,
     DatabaseForeign,
     DatabaseUnavailable,
-    PycrormError,
     TablesUntrusted,
     TablesWithheld,
 )
@@ -435,13 +434,8 @@ class PostgreSQL(Dialect):
                 _arrays(rows, len(columns)),
             )
 
-    # --- faults -------------------------------------------------------------------------------------------------
-
-    def refusal(self, error: Exception) -> str | None:
-        return postgresql_errors.refusal(error)
-
-    def translate_error(self, error: Exception, name: str) -> PycrormError:
-        return postgresql_errors.translate_error(error, name)
+    refusal = staticmethod(postgresql_errors.refusal)
+    translate_error = staticmethod(postgresql_errors.translate_error)
 
 
 _quote = PostgreSQL.syntax.identifier_preparer.quote

@@ -26,7 +26,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.store import schema, sqlite_engine
 from pycrorm_async.store.dialect import (
     Dialect,
@@ -216,13 +216,8 @@ class SQLite(Dialect):
         with _rows_refused():
             await (await _driver(connection)).execute_in_turn(statements)
 
-    # --- faults -------------------------------------------------------------------------------------------------
-
-    def refusal(self, error: Exception) -> str | None:
-        return sqlite_engine.refusal(error.orig if isinstance(error, DBAPIError) else error)
-
-    def translate_error(self, error: Exception, name: str) -> PycrormError:
-        return sqlite_engine.translate_error(error.orig if isinstance(error, DBAPIError) else error, name)
+    refusal = staticmethod(sqlite_engine.refusal)
+    translate_error = staticmethod(sqlite_engine.translate_error)
 
 
 _quote = SQLite.syntax.identifier_preparer.quote

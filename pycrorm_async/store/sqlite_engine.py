@@ -24,6 +24,7 @@ import aiosqlite
 from sqlalchemy import URL, event
 from sqlalchemy import Connection as SyncConnection
 from sqlalchemy.engine.interfaces import IsolationLevel
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 from sqlalchemy.pool import AsyncAdaptedQueuePool, ConnectionPoolEntry
 
@@ -369,8 +370,9 @@ _READ_ONLY_FOLDER = {
 _DISK_FULL = {sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_SHMMAP, sqlite3.SQLITE_IOERR_WRITE}
 
 
-def translate_error(fault: BaseException | None, database: str) -> PycrormError:
+def translate_error(error: Exception, database: str) -> PycrormError:
     """Return the error of this package to raise instead of the driver's."""
+    fault = error.orig if isinstance(error, DBAPIError) else error
     code = getattr(fault, "sqlite_errorcode", None)
     if isinstance(fault, UnicodeDecodeError) or (code is None and str(fault).startswith("Could not decode to UTF-8")):
         return DamageError(f"{database} is damaged: {fault}")
@@ -395,8 +397,9 @@ def translate_error(fault: BaseException | None, database: str) -> PycrormError:
     return InternalError(f"{database}: {fault}")
 
 
-def refusal(fault: BaseException | None) -> str | None:
+def refusal(error: Exception) -> str | None:
     """Return the reason why SQLite can never create a table or view of this definition; None for other errors."""
+    fault = error.orig if isinstance(error, DBAPIError) else error
     code = getattr(fault, "sqlite_errorcode", None)
     if code is None or code & 0xFF not in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_TOOBIG):
         return None

@@ -26,7 +26,7 @@
 10  a database stopped or killed under load, a network that cuts, stalls, resets, dribbles
         test_many_machines, test_daemon, store/test_postgresql_faults
 11  commits out of order, gaps
-        store/test_postgresql_schema (an earlier number is committed later), store/test_append
+        store/test_postgresql_concurrency (an earlier number is committed later), store/test_append
 12  a writer that is suspended and resumes, a second writer
         test_daemon, queue/test_locks_and_forks, queue/test_live_source, cli/test_writer
 13  a projection killed, several at once, an event that cannot be folded

@@ -53,6 +53,11 @@ def declaration(payload: bytes, *, position: int = 1) -> Record:
     return Record(position, None, 0, "DesignatorTypeDeclared", 1, 7, 8, payload)
 
 
+def started(number: int) -> Record:
+    payload = b'{"description":"Tutorial","created_by":"ada","host":"lab","software":"0.1.0","python":"3.11.7"}'
+    return record(episode(number), 1, kind="EpisodeStarted", payload=payload)
+
+
 def name(number: int) -> str:
     return f"00000000-0000-0000-0000-{number:012x}"
 

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import text
 
 from pycrorm_async import Memory
-from pycrorm_async.errors import PycrormError, TablesUntrusted, TablesWithheld
+from pycrorm_async.errors import DatabaseUnavailable, PycrormError, TablesUntrusted, TablesWithheld
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.projector import Projector
@@ -24,7 +24,7 @@ from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import NOTES_PLAN, pycrorm
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask, change_each, server_in_memory
-from tests.store.factories import episode, run_of
+from tests.store.factories import declaration, episode, run_of, started
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,7 @@ def owned(server: Server, *, may: str) -> str:
 async def make_log(url: str) -> EventLog:
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     await Projector(log).open()
-    await log.append(run_of(episode(1), 1, 1))
+    await log.append([started(1)])
     return log
 
 
@@ -182,6 +182,83 @@ async def test_the_roles_have_no_right_to_change_the_log_but_these(server: Serve
         ("pycrorm_folder", "UPDATE", "episode.folded"),
         ("pycrorm_folder", "UPDATE", "episode.parked"),
     }
+
+
+@pytest.fixture
+async def roles(server: Server) -> dict[str, str]:
+    """Return the URLs of the owner and of a member of each role, in a memory to which the rights were granted twice."""
+    url = server.new_database()
+    await (await make_log(url)).close()
+    grant(url)
+    grant(url)
+    return {"owner": url, **{role: member(server, url, role) for role in ("recorder", "folder", "reader")}}
+
+
+async def test_a_recorder_appends_and_cannot_fold(roles: dict[str, str]) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(roles["recorder"]), create=True)
+    new = [declaration(b'{"dtype":"A"}'), *run_of(episode(2), 1, 5)]
+    assert await log.append(new) == {}
+    assert await log.append([*new, *run_of(episode(2), 6, 7)]) == {}
+    assert ask(roles["owner"], "SELECT number, head FROM episode ORDER BY 1") == [(1, 1), (2, 7)]
+    with pytest.raises(TablesWithheld, match="may not change the tables: fold with `pycrorm writer`"):
+        await Projector(log).open()
+    await log.close()
+    for statement in ("UPDATE pycrorm.episode SET folded = 1", "CREATE TABLE pycrorm.mine (a int)"):
+        with pytest.raises(asyncpg.InsufficientPrivilegeError):
+            ask(roles["recorder"], statement)
+
+
+async def test_a_folder_appends_and_folds_also_tables_that_another_folder_made(roles: dict[str, str]) -> None:
+    address = DatabaseAddress.parse(roles["folder"])
+    log = await EventLog.open(address, create=True)
+    projector = Projector(log)
+    await projector.open()
+    assert await log.append([started(2)]) == {}
+    assert await projector.catch_up() == 2
+    await log.close()
+    assert ask(roles["owner"], "SELECT count(*) FROM memory.process_metadata") == [(2,)]
+    assert ask(roles["owner"], "SELECT number, folded FROM episode ORDER BY 1") == [(1, 1), (2, 1)]
+    for statement in ("DROP TRIGGER event_is_not_changed ON pycrorm.event", "DROP TABLE pycrorm.event"):
+        with pytest.raises(asyncpg.InsufficientPrivilegeError):
+            ask(roles["folder"], statement)
+
+
+async def test_a_reader_reads_log_tables_and_views_including_later_ones_and_writes_nothing(
+    roles: dict[str, str],
+) -> None:
+    ask(roles["folder"], "CREATE TABLE memory.later (id int)")
+    ask(roles["folder"], "CREATE VIEW memory.later_still AS SELECT * FROM memory.later")
+    assert ask(roles["reader"], "SELECT count(*) FROM later") == [(0,)]
+    assert ask(roles["reader"], "SELECT count(*) FROM later_still") == [(0,)]
+    ask(roles["folder"], "DROP VIEW memory.later_still")
+    ask(roles["folder"], "DROP TABLE memory.later")
+    log = await EventLog.open(DatabaseAddress.parse(roles["reader"]), create=False)
+    assert [each.sequence for each in await log.events(1)] == [1]
+    await log.close()
+    async with Reading.open(roles["reader"]) as reading:
+        await reading.episodes()
+    log = await EventLog.open(DatabaseAddress.parse(roles["reader"]), create=True)
+    with pytest.raises(DatabaseUnavailable, match="permission denied"):
+        await log.append(run_of(episode(3), 1, 1))
+    await log.close()
+
+
+async def test_no_role_can_change_or_delete_an_event(roles: dict[str, str]) -> None:
+    for statement in (
+        "UPDATE pycrorm.event SET payload = '{}'",
+        "DELETE FROM pycrorm.event",
+        "TRUNCATE pycrorm.event",
+        "DELETE FROM pycrorm.episode",
+        "UPDATE pycrorm.episode SET id = 'x'",
+        "DELETE FROM pycrorm.pycrorm_declaration",
+        "UPDATE pycrorm.pycrorm_log SET id = 'x'",
+        "ALTER TABLE pycrorm.event DISABLE TRIGGER ALL",
+        "SET session_replication_role = replica",
+        "DROP SCHEMA pycrorm CASCADE",
+    ):
+        with pytest.raises(asyncpg.PostgresError, match=r"permission denied|must be owner|append-only"):
+            ask(roles["folder"], statement)  # the others have no right that it has not (`test_postgresql_rights`)
+    assert ask(roles["owner"], "SELECT count(*) FROM pycrorm.event") == [(1,)]
 
 
 # === postgresql attacks =======================================================================================

@@ -1,141 +1,28 @@
-"""The log on PostgreSQL: made once by many openers, append-only for every login, with separate rights for each role."""
+"""Concurrent appends to a log on PostgreSQL store every event once and never deadlock."""
 
 from __future__ import annotations
 
 import asyncio
-from urllib.parse import urlsplit
 
 import asyncpg
 import pytest
 
-from pycrorm_async.errors import DatabaseUnavailable, TablesWithheld
-from pycrorm_async.events.codec import Record
+from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql import GRANTS
-from tests.databases import Server, ask, change_each
-from tests.store.factories import declaration, episode, record, run_of
+from tests.databases import Server, ask
+from tests.store.factories import declaration, episode, run_of, started
 
 pytestmark = pytest.mark.slow
-
-TABLES = (
-    "SELECT relname FROM pg_class WHERE relnamespace = 'pycrorm'::regnamespace AND relkind IN ('r', 'S') ORDER BY 1"
-)
-COUNTS = "SELECT count(*) FROM pycrorm.event"
 
 
 @pytest.fixture
 def database_url(server: Server) -> str:
-    """Use PostgreSQL alone: these tests are about its schema."""
+    """Use PostgreSQL alone: SQLite has one writer at a time."""
     return server.new_database()
-
-
-# --- roles ------------------------------------------------------------------------------------------------------
-
-
-def started(number: int) -> Record:
-    payload = b'{"description":"Tutorial","created_by":"ada","host":"lab","software":"0.1.0","python":"3.11.7"}'
-    return record(episode(number), 1, kind="EpisodeStarted", payload=payload)
-
-
-@pytest.fixture
-async def roles(server: Server, database_url: str) -> dict[str, str]:
-    """Return the URL of a member of each role, in a memory to which the documented rights were granted twice."""
-    database = urlsplit(database_url).path.removeprefix("/")
-    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
-    await Projector(log).open()
-    await log.append([started(1)])
-    await log.close()
-    changes = [*GRANTS, *GRANTS]
-    urls = {}
-    for role in ("recorder", "folder", "reader"):
-        member = f"{role}_of_{database}"
-        changes += [
-            f"CREATE ROLE {member} LOGIN IN ROLE pycrorm_{role}",
-            f"ALTER ROLE {member} IN DATABASE {database} SET role = 'pycrorm_{role}'",
-        ]
-        urls[role] = server.url(database, user=member)
-    change_each(database_url, changes)
-    return urls
-
-
-CANNOT = "permission denied"
-
-
-async def test_a_recorder_appends_and_cannot_fold(roles: dict[str, str], database_url: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(roles["recorder"]), create=True)
-    new = [declaration(b'{"dtype":"A"}'), *run_of(episode(2), 1, 5)]
-    assert await log.append(new) == {}
-    assert await log.append([*new, *run_of(episode(2), 6, 7)]) == {}
-    assert ask(database_url, "SELECT number, head FROM episode ORDER BY 1") == [(1, 1), (2, 7)]
-    with pytest.raises(TablesWithheld, match="may not change the tables: fold with `pycrorm writer`"):
-        await Projector(log).open()
-    await log.close()
-    for statement in ("UPDATE pycrorm.episode SET folded = 1", "CREATE TABLE pycrorm.mine (a int)"):
-        with pytest.raises(asyncpg.InsufficientPrivilegeError):
-            ask(roles["recorder"], statement)
-
-
-async def test_a_folder_appends_and_folds_also_tables_that_another_folder_made(
-    roles: dict[str, str], database_url: str
-) -> None:
-    address = DatabaseAddress.parse(roles["folder"])
-    log = await EventLog.open(address, create=True)
-    projector = Projector(log)
-    await projector.open()
-    assert await log.append([started(2)]) == {}
-    assert await projector.catch_up() == 2
-    await log.close()
-    assert ask(database_url, "SELECT count(*) FROM memory.process_metadata") == [(2,)]
-    assert ask(database_url, "SELECT number, folded FROM episode ORDER BY 1") == [(1, 1), (2, 1)]
-    for statement in ("DROP TRIGGER event_is_not_changed ON pycrorm.event", "DROP TABLE pycrorm.event"):
-        with pytest.raises(asyncpg.InsufficientPrivilegeError):
-            ask(roles["folder"], statement)
-
-
-async def test_a_reader_reads_log_tables_and_views_including_later_ones_and_writes_nothing(
-    roles: dict[str, str], database_url: str
-) -> None:
-    ask(roles["folder"], "CREATE TABLE memory.later (id int)")
-    ask(roles["folder"], "CREATE VIEW memory.later_still AS SELECT * FROM memory.later")
-    assert ask(roles["reader"], "SELECT count(*) FROM later") == [(0,)]
-    assert ask(roles["reader"], "SELECT count(*) FROM later_still") == [(0,)]
-    ask(roles["folder"], "DROP VIEW memory.later_still")
-    ask(roles["folder"], "DROP TABLE memory.later")
-    log = await EventLog.open(DatabaseAddress.parse(roles["reader"]), create=False)
-    assert [each.sequence for each in await log.events(1)] == [1]
-    await log.close()
-    async with Reading.open(roles["reader"]) as reading:
-        await reading.episodes()
-    log = await EventLog.open(DatabaseAddress.parse(roles["reader"]), create=True)
-    with pytest.raises(DatabaseUnavailable, match=CANNOT):
-        await log.append(run_of(episode(3), 1, 1))
-    await log.close()
-
-
-async def test_no_role_can_change_or_delete_an_event(roles: dict[str, str], database_url: str) -> None:
-    for statement in (
-        "UPDATE pycrorm.event SET payload = '{}'",
-        "DELETE FROM pycrorm.event",
-        "TRUNCATE pycrorm.event",
-        "DELETE FROM pycrorm.episode",
-        "UPDATE pycrorm.episode SET id = 'x'",
-        "DELETE FROM pycrorm.pycrorm_declaration",
-        "UPDATE pycrorm.pycrorm_log SET id = 'x'",
-        "ALTER TABLE pycrorm.event DISABLE TRIGGER ALL",
-        "SET session_replication_role = replica",
-        "DROP SCHEMA pycrorm CASCADE",
-    ):
-        with pytest.raises(asyncpg.PostgresError, match=r"permission denied|must be owner|append-only"):
-            ask(roles["folder"], statement)  # the others have no right that it has not (`test_postgresql_rights`)
-    assert ask(database_url, COUNTS) == [(1,)]
-
-
-# --- concurrency ------------------------------------------------------------------------------------------------------
 
 
 async def test_two_concurrent_appends_of_one_episode_store_it_once(database_url: str) -> None:
