@@ -18,7 +18,6 @@ from urllib.parse import urlsplit
 import asyncpg
 import msgspec
 
-from bench.breaking.files import small_disk
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import Record, declaration_of, encode, fingerprint
@@ -40,6 +39,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from pycrorm_async.writer.drain import Backoff, Drain
+from tests.crash.disk_machine import small_disk
 from tests.databases import Server, ask
 from tests.projections.event_script import T0_NS, Script
 from tests.store.factories import cancel_at_await, episode, run_of

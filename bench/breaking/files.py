@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import random
 import shutil
-import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from bench.breaking.outcome import Event, Outcome, Step
@@ -33,17 +30,24 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Backoff, Drain
-from tests.crash.test_disk import ON_A_SMALL_DISK, SLOW, Machine, break_next_sync, live_through_cuts, machine_on
+from tests.crash.disk_machine import (
+    ON_A_SMALL_DISK,
+    ROOMY,
+    SLOW,
+    Machine,
+    break_next_sync,
+    disk_of_256_kib,
+    live_through_cuts,
+    machine_on,
+)
 from tests.databases import ask
-from tests.queue.factories import RECORDER, SMALL, FolderWriter, drain, ended, episode, make, node, recover, started
+from tests.queue.factories import RECORDER, FolderWriter, drain, ended, episode, make, node, recover, started
 from tests.queue.forged_segments import change_a_frame, change_the_header
 from tests.writer.fakes import CountingFold, ForwardingDestination
 
 # === files ====================================================================================================
 #
 # Faults of the queue's files and disk: torn writes, flipped bits, power cuts, failed syncs, full disks, clocks.
-
-ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
 
 
 def events_of(records: Iterable[Record]) -> list[Event]:
@@ -204,7 +208,7 @@ def full_disk(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outc
     outcome = Outcome()
     for _ in range(rounds):
         place = Path(tempfile.mkdtemp(dir=folder))
-        with _small_disk(place) as kind:
+        with disk_of_256_kib(place) as kind:
             asyncio.run(_fill_and_empty(outcome, place / "spool", rng))
         outcome.note = kind
         step()
@@ -228,39 +232,6 @@ async def _fill_and_empty(outcome: Outcome, spool: Path, rng: random.Random) -> 
     drained += events_of(await drain(queue))
     queue.release()
     outcome.compare(expected, drained)
-
-
-@contextmanager
-def small_disk(place: Path, size: str) -> Iterator[bool]:
-    """Mount a tmpfs of this size; yield False without the permission to mount."""
-    place.mkdir(exist_ok=True)
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
-    mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
-    try:
-        yield mounted
-    finally:
-        if mounted:
-            subprocess.run(["umount", str(place)], check=True)
-
-
-@contextmanager
-def _small_disk(place: Path) -> Iterator[str]:
-    with small_disk(place, "256k") as mounted:
-        if mounted:
-            yield "a tmpfs of 256 KiB"
-            return
-    allocate = os.posix_fallocate
-
-    def refusing(descriptor: int, offset: int, size: int) -> None:
-        if sum(path.stat().st_size for path in place.rglob("*")) + size > 2**18:
-            raise OSError(28, os.strerror(28))
-        allocate(descriptor, offset, size)
-
-    os.posix_fallocate = refusing
-    try:
-        yield "simulated: no permission to mount a small disk"
-    finally:
-        os.posix_fallocate = allocate
 
 
 def clock_jumps(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import msgspec
 
 from bench.breaking.databases import start_again
-from bench.breaking.files import ROOMY, events_of, put
+from bench.breaking.files import events_of, put
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async import Memory
 from pycrorm_async.errors import SpoolClosed, SpoolFull
@@ -44,6 +44,7 @@ from pycrorm_async.settings import Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.crash import recorder_process
+from tests.crash.disk_machine import ROOMY
 from tests.crash.step_robot import SETTINGS, StepActionPerformable, report
 from tests.databases import Server, ask
 from tests.queue.factories import SMALL, episode, make, node, recover

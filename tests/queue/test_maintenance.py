@@ -316,7 +316,7 @@ async def test_a_repair_killed_at_any_step_is_completed_by_the_next_one(
 # --- damage anywhere --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [*range(60), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(60, 600))])
+@pytest.mark.parametrize("seed", [*range(30), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(30, 600))])
 async def test_whatever_is_damaged_every_record_is_drained_or_reported(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
     author = FolderWriter(tmp_path / "spool", settings=ROOMY)
