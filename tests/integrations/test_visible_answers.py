@@ -11,7 +11,6 @@ import pytest
 from pycrorm_async.store.address import DatabaseAddress
 from tests.cli.hostile_memory import BAD, DRIVES_A_TERMINAL, record_hostile_episodes
 
-pytest.importorskip("mcp")
 pytestmark = pytest.mark.slow
 
 CALLS: list[tuple[str, dict[str, Any]]] = [

@@ -16,10 +16,9 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import DatabaseForeign, TablesOutdated
+from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.events.codec import Decoder, Upcaster
 from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
-from pycrorm_async.operations import rebuild
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
@@ -38,12 +37,6 @@ from tests.store.factories import declaration, episode, run_of
 from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def as_written(tmp_path: Path) -> str:
-    """The URL of the golden memory, with the spool of a dead recorder beside it."""
-    return unpack_memory_v1(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -347,43 +340,6 @@ async def test_an_upcaster_serves_fold_rebuild_and_snapshots_of_older_events(
 
 
 # --- another version of the fold --------------------------------------------------------------------------------------
-
-
-REBUILD = (
-    rf"by version {PROJECTION_VERSION - 1} of the fold, this is version {PROJECTION_VERSION}: run `pycrorm rebuild`$"
-)
-
-
-async def test_events_are_recorded_beside_tables_of_an_older_fold_and_visible_after_a_rebuild(
-    golden: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", 0)
-    before = tables_of(golden)
-    ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION - 1}")
-    greet = greeting(whom=str)
-    async with Memory.open(golden) as memory:
-        await greet("Eve").perform()
-        for asked in (memory.flush, memory.reading.refresh, memory.reading.episodes):
-            with pytest.raises(TablesOutdated, match=REBUILD):
-                await asked()
-    with pytest.raises(TablesOutdated, match=REBUILD):
-        await designators_of(golden, "GreetAction")
-    assert ask(golden, "SELECT head, folded FROM episode ORDER BY number") == [(18, 18), (4, 4), (6, 0), (6, 0)]
-    async with Memory.open(golden) as memory:
-        await greet("Flo").perform()
-        await rebuild_memory(golden)
-        await memory.flush()
-        assert await designators_of(golden, "GreetAction", "whom") == [
-            ADA, CLEO, DORA, ("GreetAction", "Eve"), ("GreetAction", "Flo"),
-        ]  # fmt: skip
-    after = tables_of(golden)
-    assert all(after[name].items() >= rows.items() for name, rows in before.items())
-
-
-async def test_opening_tables_of_the_first_version_demands_a_rebuild(as_written: str) -> None:
-    asked = rf"by version 3 of the fold, this is version {PROJECTION_VERSION}: run `pycrorm rebuild`$"
-    with pytest.raises(TablesOutdated, match=asked):
-        await designators_of(as_written, "GreetAction")
 
 
 async def test_tables_of_a_newer_fold_are_refused(golden: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextvars
 import functools
 import random
 import sqlite3
@@ -202,54 +201,6 @@ async def test_concurrent_plans_in_tasks_never_share_a_parent(tmp_path: Path, pl
     trees = recorded(tmp_path / "memory.db")
     for seed, journal in journals.items():
         assert trees.get(seed, []) == expected_rows(journal), f"seed {seed}: {plan_of(seed)}"
-
-
-class Threads(ActionAbstract):
-    """Perform three plans, each in a thread of its own with a copy of the context."""
-
-    def __init__(self, journals: list[Journal]) -> None:
-        self.journals = journals
-
-    async def perform(self) -> None:
-        await asyncio.gather(*(asyncio.to_thread(self._run, journal) for journal in self.journals))
-
-    def _run(self, journal: Journal) -> None:
-        contextvars.copy_context().run(asyncio.run, self._plan(journal))
-
-    async def _plan(self, journal: Journal) -> None:
-        task = asyncio.create_task(built(journal.plan, journal).perform())
-        await asyncio.wait([task, *journal.tasks])
-        if not task.cancelled():
-            task.exception()
-
-
-async def test_concurrent_plans_in_threads_never_share_a_parent(tmp_path: Path) -> None:
-    seeds = [seed for seed in range(60) if seed % 5 < 2]
-    rounds = [[Journal(plan_of(seed)) for seed in seeds[number : number + 3]] for number in range(0, len(seeds), 3)]
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
-        for number, journals in enumerate(rounds):
-            async with memory.episode(description=str(number)):
-                await Threads(journals).perform()
-        await memory.flush()
-    trees = recorded(tmp_path / "memory.db")
-    for number, journals in enumerate(rounds):
-        assert sorted(shapes(trees[number])) == sorted(
-            shape for each in journals for shape in shapes(expected_rows(each))
-        )
-
-
-def shapes(rows: list[Row]) -> list[str]:
-    """Return the trees below each root (or below `Threads`), as text, in order."""
-    texts = [f"{dtype} {status} {reason} {message}" for dtype, _, status, reason, message in rows]
-    children: dict[int | None, list[int]] = defaultdict(list)
-    for number, (_, parent, *_) in enumerate(rows):
-        children[parent].append(number)
-
-    def shape(number: int) -> str:
-        return f"{texts[number]} [{', '.join(map(shape, children[number]))}]"
-
-    top = children[0] if rows[0][0] == "ThreadsAction" else children[None]
-    return [shape(each) for each in top]
 
 
 # === random plans =============================================================================================
