@@ -63,11 +63,11 @@ from pycrorm_async.record.values import (
 #
 # `OrderedCalls` runs the calls of one memory one after the other, whichever threads make them.
 #
-# Theory of operation. A call is put into `_left`, and a thread that holds the lock runs what is left there in order. An
-# ordinary thread waits for the lock, so its call has run when it returns. The garbage collector, or a method of a key,
-# may make a call in the middle of another one, in the thread that holds the lock: the lock is reentrant, `_is_running`
-# shows this, and the outer call's thread runs the inner one afterwards. A thread of the memory does not wait, because
-# the holder of the lock may wait for the room in the spool that this thread makes: it leaves the call to the holder.
+# Theory of operation. A thread runs its call under the lock, so its call has run when it returns. The garbage
+# collector, or a method of a key, may make a call in the middle of another one, in the thread that holds the lock: the
+# lock is reentrant, `_is_running` shows this, and the call is left in `_left` for the outer one. A thread of the memory
+# must not wait for the lock, because its holder may wait for the room in the spool that this thread makes: it takes the
+# lock only if it is free, and otherwise leaves the call to the holder.
 #
 # A signal handler may raise KeyboardInterrupt in the main thread when any call returns. `with` on the lock itself
 # cannot be interrupted between taking the lock and entering the block, nor before the lock is released; `acquire` and
@@ -89,23 +89,30 @@ class OrderedCalls:
 
     def run(self, call: Callable[[], object]) -> None:
         """Run a call, which must not raise, after all earlier ones."""
-        self._left.append(call)
         if is_of_memory():
+            self._left.append(call)
             while self._left and self._lock.acquire(blocking=False):
                 try:
-                    self._drain()
+                    if self._is_running:  # as below
+                        return
+                    self._run(_nothing)
                 finally:
                     self._lock.release()
-        else:
-            while self._left:  # once more if a thread of the memory came before the lock was released
-                with self._lock:
-                    if self._is_running:  # in a call that this thread runs, which is followed by this one
-                        return
-                    self._drain()
+            return
+        with self._lock:
+            if self._is_running:  # in a call that this thread runs, which is followed by this one
+                self._left.append(call)
+                return
+            self._run(call)
+        while self._left:  # a thread of the memory came before the lock was released
+            with self._lock:
+                self._run(_nothing)
 
-    def _drain(self) -> None:
+    def _run(self, call: Callable[[], object]) -> None:
         self._is_running = True  # followed by `try` without a call, so that Ctrl-C cannot separate the two
         try:
+            self._run_left()
+            call()
             self._run_left()
         finally:
             self._is_running = False
@@ -113,6 +120,10 @@ class OrderedCalls:
     def _run_left(self) -> None:
         while self._left:
             self._left.popleft()()
+
+
+def _nothing() -> None:
+    """Write nothing."""
 
 
 def reported(

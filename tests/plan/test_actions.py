@@ -317,15 +317,6 @@ async def test_gripper_and_look_at_are_one_motion_each(scene: Scene) -> None:
     ]
 
 
-async def test_actions_accept_one_arm_at_a_time(scene: Scene) -> None:
-    for action in (
-        PickUpActionPerformable(scene.milk, Arms.BOTH, Grasp.FRONT),
-        PlaceActionPerformable(scene.milk, Arms.BOTH, Pose()),
-    ):
-        with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, and does not work with BOTH"):
-            await action.perform()
-
-
 def test_an_action_can_be_built_from_its_fields_alone(scene: Scene) -> None:
     with pytest.raises(ResolutionError, match="grasp: expected Grasp, got str 'front'"):
         PickUpActionPerformable(scene.milk, Arms.LEFT, "front")  # type: ignore[arg-type]  # the fault here

@@ -13,10 +13,7 @@ import pytest
 
 from pycrorm_async.plan import (
     ActionAbstract,
-    ChosenRobot,
     Monitor,
-    MoveGripperMotion,
-    MoveMotion,
     MoveTorsoAction,
     NavigateActionPerformable,
     Outcome,
@@ -27,9 +24,9 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.execution import current_simulation
 from pycrorm_async.plan.failures import NotALanguageExpression
-from pycrorm_async.world import Arms, GripperState, Pose, current_world
+from pycrorm_async.world import Pose, current_world
 from tests.plan.conftest import Scene
-from tests.plan.fakes import Around, Recording, Step, drawn, failing
+from tests.plan.fakes import Around, Step, drawn, failing
 
 # === language monitors ========================================================================================
 #
@@ -95,19 +92,6 @@ async def test_a_plan_that_never_suspends_is_interrupted_between_its_nodes() -> 
     ]
 
 
-async def test_the_robot_stays_where_the_interruption_stopped_it(scene: Scene) -> None:
-    def beyond_one_metre() -> bool:
-        return scene.robot.pose.position.x > 1
-
-    way = [NavigateActionPerformable(Pose([x / 10, 0, 0])) for x in range(1, 40)]
-    plan = way[0] + way[1]
-    for each in way[2:]:
-        plan += each
-    outcome = await (plan >> Monitor(beyond_one_metre)).perform()
-    assert outcome == INTERRUPTED
-    assert scene.robot.pose.position.x == pytest.approx(1.1)
-
-
 @pytest.mark.parametrize("kind", ["sync", "async", "event"])
 async def test_a_plan_is_interrupted_inside_an_await(kind: str) -> None:
     happened = asyncio.Event()
@@ -129,25 +113,6 @@ async def test_a_plan_is_interrupted_inside_an_await(kind: str) -> None:
         "└── Around INTERRUPTED (CancelledError)",
         "    └── Waiting INTERRUPTED (CancelledError)",
     ]
-
-
-async def test_a_motion_that_awaits_is_interrupted_at_its_await() -> None:
-    driving, reached = asyncio.Event(), []
-
-    class Slow:
-        async def navigate(self, motion: MoveMotion) -> None:
-            driving.set()
-            await asyncio.sleep(60)
-            reached.append(motion)
-
-        async def move_gripper(self, motion: MoveGripperMotion) -> None:
-            raise AssertionError("after the interruption")
-
-    there = MoveMotion(Pose([1, 0, 0])) + MoveGripperMotion(GripperState.OPEN, Arms.LEFT)
-    with ChosenRobot("slow", Slow()), collected_tree() as tree:  # type: ignore[arg-type]  # it has no more
-        assert await (there >> Monitor(driving)).perform() == INTERRUPTED
-    assert reached == []
-    assert [node.status.name for node in tree] == ["INTERRUPTED"] * 3
 
 
 async def test_a_monitor_that_holds_from_the_start_lets_no_node_start() -> None:
@@ -194,20 +159,6 @@ async def test_each_of_nested_monitors_interrupts_what_is_inside_it() -> None:
         "│       │   └── Waiting INTERRUPTED (CancelledError)",
         "│       └── Waiting INTERRUPTED (CancelledError)",
         "└── Step SUCCEEDED",
-    ]
-
-
-async def test_the_outer_of_two_monitors_interrupts_the_inner_one_too() -> None:
-    outer, waiting = asyncio.Event(), Waiting()
-    with collected_tree() as tree:
-        task = asyncio.create_task((waiting >> Monitor(lambda: False) >> Monitor(outer)).perform())
-        await waiting.begun.wait()
-        outer.set()
-        assert await task == INTERRUPTED
-    assert drawn(tree) == [
-        "Monitor INTERRUPTED",
-        "└── Monitor INTERRUPTED (CancelledError)",
-        "    └── Waiting INTERRUPTED (CancelledError)",
     ]
 
 
@@ -359,19 +310,6 @@ async def test_a_subclass_of_an_expression_keeps_its_class() -> None:
     plan = MoveTorsoAction([0.1]) >> monitor
     assert type(plan) is Careful
     assert (plan.interval_s, monitor.operands) == (2.0, ())
-
-
-async def test_a_recorder_is_notified_of_interruptions_in_legal_order() -> None:
-    with Recording().listening() as recording:
-        await ((Step("a") * 1000 >> Monitor(after(3))) + Step("b")).perform()
-    assert recording.open == []
-    assert recording.notes[-5:] == [
-        "end Repeat INTERRUPTED",
-        "end Monitor INTERRUPTED",
-        "start Step",
-        "end Step SUCCEEDED",
-        "end Sequential SUCCEEDED",
-    ]
 
 
 # === monitors in simulation ===================================================================================

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import random
 from collections.abc import Iterable
 from contextlib import suppress
@@ -195,33 +194,6 @@ async def test_a_deadlock_is_refused_and_names_the_part(scene: Scene) -> None:
     assert log == ["a", "a."]
 
 
-async def test_a_cycle_of_five_is_broken_once_and_the_others_continue() -> None:
-    parts = list(Resource)
-    log: list[str] = []
-    ring = [
-        Around(step(f"{number}", log, parts[(number + 1) % 5]), needs=[parts[number]], before=2 + number)
-        for number in range(5)
-    ]
-    with pytest.raises(ResourceDeadlock) as caught:
-        await Parallel(*ring).perform()
-    assert caught.value.resource is parts[0]
-    assert log == ["3", "3.", "2", "2.", "1", "1.", "0", "0."]
-
-
-async def test_a_plan_may_retry_after_a_refused_wait() -> None:
-    log: list[str] = []
-
-    class Patient(ActionAbstract):
-        async def perform(self) -> None:
-            try:
-                await Around(step("b", log, LEFT), needs=[RIGHT], before=4).perform()
-            except ResourceDeadlock:
-                await step("c", log, LEFT).perform()
-
-    await (Around(step("a", log, RIGHT), needs=[LEFT], before=2) | Patient()).perform()
-    assert "".join(log) == "aa.cc."
-
-
 async def test_no_node_queues_behind_one_that_waits_for_the_end_of_its_own_parent() -> None:
     log: list[str] = []
     # b waits for base and head; a node inside the holder of the base also needs the head, and goes first.
@@ -381,23 +353,6 @@ async def test_every_plan_ends_whatever_its_nested_nodes_require(seed: int) -> N
     failures = {type(node.failure).__name__ for node in tree if node.failure is not None}
     assert failures <= {"ResourceDeadlock", "PlanFailures"}
     assert held == []
-
-
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-async def test_waiting_nodes_are_served_in_order_of_arrival(order: tuple[int, ...]) -> None:
-    log: list[str] = []
-
-    class Later(ActionAbstract):
-        def __init__(self, number: int) -> None:
-            self.number = number
-
-        async def perform(self) -> None:
-            for _ in range(order[self.number] + 1):
-                await asyncio.sleep(0)
-            await step(str(self.number), log, BASE).perform()
-
-    await (step("x", log, BASE, turns=9) | Later(0) | Later(1) | Later(2)).perform()
-    assert [each for each in log if each in "012"] == [str(order.index(place)) for place in range(3)]
 
 
 # === resources ================================================================================================

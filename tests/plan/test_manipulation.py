@@ -295,14 +295,6 @@ async def test_an_object_of_several_links_is_held_only_at_its_nearest_link(scene
     assert scene.robot.attachments == {crane: LEFT_TOOL}
 
 
-async def test_neither_furniture_nor_the_robot_is_held(scene: Scene) -> None:
-    before = scene.world.save_state()
-    for forbidden in (scene.kitchen, scene.robot):
-        with pytest.raises(IllPosedGoalFailure, match=f"{forbidden.name} cannot be held by a gripper"):
-            await GripActionPerformable(Arms.LEFT, forbidden, 1.0).perform()
-    assert scene.world.save_state() == before
-
-
 async def test_an_effort_below_zero_holds_nothing(scene: Scene) -> None:
     await reached(scene, 1.3)
     for effort in (-1.0, math.nan):

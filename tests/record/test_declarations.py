@@ -149,17 +149,6 @@ def test_a_class_with_fields_that_is_no_dataclass_is_refused() -> None:
         declared_type(BareActionPerformable)
 
 
-def test_a_dtype_whose_table_is_one_of_the_memorys_own_is_refused() -> None:
-    class Odd(ActionAbstract):
-        dtype = "Pose"
-
-        async def perform(self) -> None:
-            """Succeed without doing anything."""
-
-    with pytest.raises(DeclarationRefused, match="'pose', which the memory itself uses"):
-        declared_type(Odd)
-
-
 def saying(place: int) -> type[ActionAbstract]:
     if place == 0:
 
@@ -253,18 +242,6 @@ def test_the_aliases_of_a_class_are_declared_and_not_inherited() -> None:
     loud = type("LoudWelcomeAction", (welcome,), {"__module__": __name__})
     assert declared_type(loud).declaration.aliases == ()
     assert b"aliases" not in declared_type(loud).payload
-
-
-def test_a_field_may_be_called_aliases() -> None:
-    @dataclass
-    class ListAction(ActionAbstract):
-        aliases: str = "many"
-
-        async def perform(self) -> None:
-            """Succeed without doing anything."""
-
-    declaration = declared_type(ListAction).declaration
-    assert ([each.name for each in declaration.fields], declaration.aliases) == (["aliases"], ())
 
 
 @pytest.mark.parametrize(
