@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from enum import Enum
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, dataclass_transform
 
 import msgspec
@@ -377,12 +378,13 @@ class HybridOf(hybrid_property[_Value]):
     """
 
     def __init__(self, name: str, *, on_request: bool = False) -> None:
-        def read(row: Any) -> Any:
-            if on_request:
-                require_loaded(row, f"_{name}")
-            return getattr(row, f"_{name}")
+        private = attrgetter(f"_{name}")
 
-        super().__init__(read, expr=lambda class_: getattr(class_, f"_{name}"))
+        def read(row: Any) -> Any:
+            require_loaded(row, f"_{name}")
+            return private(row)
+
+        super().__init__(read if on_request else private, expr=private)
         self.__name__ = name
 
     if not TYPE_CHECKING:  # which takes the types from SQLAlchemy's own
@@ -502,7 +504,7 @@ class KnownClasses:
             identities = {name: name for name in mapped} | tables | self.own
             *names, root = lineage.split(" ")
             candidates = (identities.get(each) for name in names for each in (name, table_name(name)))
-            fitting = (each for each in candidates if each is not None and _root(mapped[each]) == root)
+            fitting = (each for each in candidates if each is not None and mapped[each].class_.__root__ == root)
             identity = self._identities[lineage] = next(fitting, root)
         return identity
 
@@ -510,12 +512,6 @@ class KnownClasses:
         """Replace the identities of generated classes in this engine."""
         self.own = dict(own)
         self._identities.clear()
-
-
-def _root(mapper: Mapper[Any]) -> str:
-    """Return the nearest of Action, Motion, Language and Designator."""
-    identities = (str(each.polymorphic_identity) for each in mapper.iterate_to_root())
-    return next(each for each in identities if each in ("Action", "Motion", "Language", "Designator"))
 
 
 def known_classes(dialect: Dialect) -> KnownClasses:

@@ -170,7 +170,7 @@ class DynamicClasses:
             identity = str(mapper.polymorphic_identity)
             table = mapper.local_table
             assert isinstance(table, Table)
-            fits = not declarations or _root(mapper.class_) is _ROOTS[declarations[0].kind]
+            fits = not declarations or mapper.class_.__root__ == declarations[0].kind.title()
             if fits and "@" not in identity and wanted & {identity, table.name}:
                 return mapper.class_
         return None
@@ -213,7 +213,11 @@ class DynamicClasses:
             if base is None and dtype in self._declared and dtype not in descendants and len(descendants) < _DEPTH_MAX:
                 self._make(dtype, descendants)
                 base = self._classes.get(dtype)
-            if base is not None and _root(base) is root and len(base.__mro__) - len(root.__mro__) < _DEPTH_MAX:
+            if (
+                base is not None
+                and base.__root__ == root.__root__
+                and len(base.__mro__) - len(root.__mro__) < _DEPTH_MAX
+            ):
                 return base
         return root
 
@@ -275,11 +279,3 @@ def _entries(field: FieldDeclared) -> property:
     """Return a property with the values of a list field, or of a dict field by key."""
     read = Designator.mapping if field.type == "dict" else Designator.entries  # a field may have these names itself
     return property(lambda designator: read(designator, field.name))
-
-
-def _root(class_: type[Designator]) -> type[Designator]:
-    """Return `Action`, `Motion` or `Language` if the class is or descends from it, otherwise `Designator`."""
-    for root in (Action, Motion, Language):
-        if issubclass(class_, root):
-            return root
-    return Designator

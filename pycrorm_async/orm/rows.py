@@ -442,6 +442,8 @@ class Designator(RowOfEvent, Base):
     """
 
     __tablename__ = "designator"
+    __root__: ClassVar[str] = "Designator"
+    """The nearest of Action, Motion, Language and Designator."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         # Each class gets a table of its own and that table's key. Unless the class names the table, it has the name of
@@ -533,13 +535,19 @@ def _mapped_base(class_: Any) -> Any:
 class Action(Designator):
     """A performed action: a task that a plan requests."""
 
+    __root__ = "Action"
+
 
 class Motion(Designator):
     """A performed motion: one command to a robot's controllers."""
 
+    __root__ = "Motion"
+
 
 class Language(Designator):
     """A performed expression of the plan language. The nodes of its operands are children of its node."""
+
+    __root__ = "Language"
 
 
 # --- parameters of actions and motions --------------------------------------------------------------------------

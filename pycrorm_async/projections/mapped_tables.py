@@ -41,8 +41,7 @@ def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
     from pycrorm_async.orm import Action, Designator, Language, Motion
     from pycrorm_async.orm.base import is_built_in
 
-    kinds = {Action: "action", Motion: "motion", Language: "language"}
-    roots = (Designator, *kinds)
+    roots = (Designator, Action, Motion, Language)
     for mapper in root.__mapper__.self_and_descendants:
         table = mapper.local_table
         if mapper.class_ in roots or mapper.class_.metadata is not root.metadata or not isinstance(table, Table):
@@ -50,9 +49,8 @@ def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
         if table.metadata is not root.metadata:
             continue
         columns = {str(each.name): column_storage(each) for each in table.columns if each.name not in ("id", EPISODE)}
-        built_in = is_built_in(mapper.class_)
-        kind = next((kind for root, kind in kinds.items() if issubclass(mapper.class_, root)), None)
-        yield Leaf(str(table.name), columns, mapper.class_.__name__ if built_in else None, kind if built_in else None)
+        named = (mapper.class_.__name__, mapper.class_.__root__.lower()) if is_built_in(mapper.class_) else ()
+        yield Leaf(str(table.name), columns, *named)
 
 
 def column_storage(column: Column[Any]) -> Storage:
