@@ -14,7 +14,7 @@ folding it stopped; both are normally null.
 A refused episode is still folded up to its head, and a parked episode still grows, because a fault in a table must not
 stop the log. A refusal ends when the missing records arrive; a rebuild releases a parked episode.
 
-`address` parses URLs, `append` decides about a batch and writes it, `log` creates and recognises logs and is the
-interface for other packages. `dialect` defines the differences between databases; `sqlite` and `postgresql` implement
-it.
+`address` parses URLs, `schema` defines the tables and statements, `append` decides about a batch and writes it, `log`
+creates and recognises logs and is the interface for other packages. `dialect` defines the differences between
+databases; `sqlite` and `postgresql` implement it.
 """

@@ -97,7 +97,7 @@ class Dialect(ABC):
     faults: ClassVar[tuple[type[Exception], ...]]
 
     def __init__(self) -> None:
-        self._compiled: dict[Executable, tuple[str, list[str], dict[str, Any]]] = {}
+        self._compiled: dict[Executable, tuple[str, Sequence[str], dict[str, Any]]] = {}
 
     @cached_property
     def migrations(self) -> Migrations:
@@ -111,8 +111,8 @@ class Dialect(ABC):
         compiled = self._compiled.get(statement)
         if compiled is None:
             text = self.compile(statement)
-            compiled = str(text), list(getattr(text, "positiontup", None) or ()), dict(text.params)
-            self._compiled[statement] = compiled
+            constants = {name: each for name, each in text.params.items() if each is not None}
+            compiled = self._compiled[statement] = str(text), getattr(text, "positiontup", None) or (), constants
         sql, names, constants = compiled
         batches = {name: msgspec.json.encode(each).decode() for name, each in values.items() if isinstance(each, list)}
         parameters = constants | values | batches

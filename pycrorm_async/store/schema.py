@@ -4,8 +4,8 @@ A statement is a constant, compiled once per database (`Dialect.execute`). A bat
 rows arrive as one JSON array, because `executemany` on SQLite releases the interpreter lock at every row and waits up
 to 5 ms to get it back beside a busy plan. Events alone are inserted and read by statements of each dialect.
 
-The tables are those of format 1, which both `MIGRATIONS` begin with. `INCARNATION`, `DIGEST` and `BLOB` are not part of
-the format: they are created when they are first needed, and older programs still use the log.
+The tables are those of format 1, with which the steps of `Dialect.migrations` begin. `INCARNATION`, `DIGEST` and `BLOB`
+are not part of the format: they are created when they are first needed, and older programs still use the log.
 """
 
 from __future__ import annotations

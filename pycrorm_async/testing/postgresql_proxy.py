@@ -18,6 +18,7 @@ import struct
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 from urllib.parse import quote
@@ -177,12 +178,11 @@ class Proxy:
 
     async def accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
-        if self._refusing:
-            writer.close()
-            return
         try:
+            if self._refusing:
+                raise ConnectionRefusedError
             upstream = await asyncio.open_unix_connection(str(self._server_socket))
-        except OSError:  # the server is down
+        except OSError:  # also of a server that is down
             writer.close()
             return
         link = _Link(self, (reader, writer), upstream)
@@ -193,20 +193,15 @@ class Proxy:
             self._links.discard(link)
 
 
+@dataclass(eq=False)
 class _Link:
     """One connection, in both directions."""
 
-    def __init__(
-        self,
-        proxy: Proxy,
-        client: tuple[asyncio.StreamReader, asyncio.StreamWriter],
-        server: tuple[asyncio.StreamReader, asyncio.StreamWriter],
-    ) -> None:
-        self._proxy = proxy
-        self._client = client
-        self._server = server
-        self._swallowing = False
-        self.last = False
+    proxy: Proxy
+    client: tuple[asyncio.StreamReader, asyncio.StreamWriter]
+    server: tuple[asyncio.StreamReader, asyncio.StreamWriter]
+    swallowing: bool = False
+    last: bool = False
 
     async def run(self) -> None:
         ways = [asyncio.create_task(self._up()), asyncio.create_task(self._down())]
@@ -219,10 +214,10 @@ class _Link:
             self.end(reset=False)
 
     def swallow(self) -> None:
-        self._swallowing = True
+        self.swallowing = True
 
     def end(self, *, reset: bool) -> None:
-        for _, writer in (self._client, self._server):
+        for _, writer in (self.client, self.server):
             if reset:
                 own: socket.socket = writer.get_extra_info("socket")
                 with contextlib.suppress(OSError):
@@ -231,23 +226,23 @@ class _Link:
                 writer.transport.abort() if reset else writer.close()
 
     async def _up(self) -> None:
-        while chunk := await self._client[0].read(self._proxy.chunk_bytes):
-            await self._proxy.flowing()
-            passed = self._proxy.from_client(self, chunk)
-            if self._client[1].is_closing():
+        while chunk := await self.client[0].read(self.proxy.chunk_bytes):
+            await self.proxy.flowing()
+            passed = self.proxy.from_client(self, chunk)
+            if self.client[1].is_closing():
                 return
-            self._server[1].write(passed)
-            await self._server[1].drain()
+            self.server[1].write(passed)
+            await self.server[1].drain()
             if self.last:
                 return
 
     async def _down(self) -> None:
-        while chunk := await self._server[0].read(self._proxy.chunk_bytes):
-            await self._proxy.flowing()
-            if self._swallowing:
+        while chunk := await self.server[0].read(self.proxy.chunk_bytes):
+            await self.proxy.flowing()
+            if self.swallowing:
                 return
-            self._client[1].write(self._proxy.from_server(chunk))
-            await self._client[1].drain()
+            self.client[1].write(self.proxy.from_server(chunk))
+            await self.client[1].drain()
 
 
 @asynccontextmanager
