@@ -68,8 +68,6 @@ _WATCH_S = 1.0
 """The interval between two checks that a SQLite file still exists; a check takes two microseconds."""
 
 _log = logging.getLogger("pycrorm_async")
-
-
 _HEADS_MAX: Final = 64
 """Bounds the episodes whose confirmed heads a process compares: more than it appends to at once."""
 _RECORDERS_MAX: Final = 256
@@ -169,6 +167,7 @@ class LogAndTables:
         the first comparison of a process a healing that changed nothing is not reported again.
         """
         changed: dict[EpisodeId, EpisodeRow] = {}
+        declared: set[bytes] = set()  # each segment repeats declarations
         appended = 0
         numbers = await asyncio.to_thread(self._numbers.read)
         await self.log.skip_numbers(max(numbers.values(), default=0))
@@ -178,7 +177,14 @@ class LogAndTables:
                 while (part := await asyncio.to_thread(next, parts, None)) is not None:
                     rows = await self.log.heads(list({each.episode for each in part if each.episode is not None}))
                     heads = {each: row.head for each, row in rows.items()}
-                    lost = [each for each in part if each.episode is None or each.sequence > heads.get(each.episode, 0)]
+                    lost = [
+                        each
+                        for each in part
+                        if (
+                            each.sequence > heads.get(each.episode, 0) if each.episode else each.payload not in declared
+                        )
+                    ]
+                    declared.update(each.payload for each in lost if each.episode is None)
                     for start in range(0, len(lost), self._batch_events_max):
                         batch = lost[start : start + self._batch_events_max]
                         for each, row in (await self.log.store(batch, numbers=numbers)).rows.items():
