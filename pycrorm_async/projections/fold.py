@@ -61,6 +61,8 @@ from pycrorm_async.projections.node_row import (
     TORSO_HEIGHT,
 )
 from pycrorm_async.projections.row_batch import (
+    NOT_FIRST,
+    OBJECT_COLUMNS,
     POSE_COLUMNS,
     CannotFold,
     Designators,
@@ -71,7 +73,6 @@ from pycrorm_async.projections.row_batch import (
     Rows,
     json_text,
     microseconds,
-    object_row,
     pose_columns,
     pose_row,
     row_of,
@@ -262,7 +263,7 @@ def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designat
     if added.description is not None:
         rows.descriptions.add(added.description)
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
-    columns = object_row(
+    columns = (
         own, number, "Object", added.name, added.object_type, own, None, own, time, node,
         joints, added.description, color, added.model, added.serial, added.mass_kg, added.base_link,
     )  # fmt: skip
@@ -275,7 +276,7 @@ def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designat
     time = microseconds(event.wall_ns)
     rows.inserts["pose"].append(pose_row(own, number, moved.pose))
     rows.inserts["object"].append(
-        object_row(own, number, "Object", moved.name, moved.object_type, own, None, identity, time, node)
+        (own, number, "Object", moved.name, moved.object_type, own, None, identity, time, node, *NOT_FIRST)
     )
 
 
@@ -400,6 +401,7 @@ _decode = Decoder(
 ).decode
 
 for _table, _columns in {
+    "object": f"{OBJECT_COLUMNS} joints description_fingerprint color model serial mass_kg base_link",
     "episode_tagging": "id position process_metadata_id tag added time",
     "object_removal": "id process_metadata_id object_id identity_id time node_id",
     "attachment": "id process_metadata_id kind parent_id child_id link time node_id",

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from operator import itemgetter
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, Self, TypeAlias, cast
+from typing import Any, Final, NamedTuple, Self, TypeAlias
 
 import msgspec
 
@@ -142,6 +142,9 @@ _ROWS_OF_EPISODE, _ROWS_OF_EVENT = row_id(1, 0, 0), row_id(0, 1, 0)
 POSE_COLUMNS = "x y z qx qy qz qw frame"
 """The columns of a pose, in the order of `pose_columns`."""
 assert " ".join(COLUMNS["pose"]) == f"id process_metadata_id {POSE_COLUMNS} time", "`pose_row` has another order"
+OBJECT_COLUMNS = "id process_metadata_id dtype name obj_type pose_id part_of_id identity_id time node_id"
+"""The columns that every row of an object's state has; those behind them only the first row of an object has."""
+NOT_FIRST: Row = (None,) * (len(COLUMNS["object"]) - len(OBJECT_COLUMNS.split()))
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND = timedelta(microseconds=1)
 _SCALARS: dict[str, tuple[type, ...]] = {
@@ -238,59 +241,6 @@ def _datetime_us(field: FieldDeclared, value: Any) -> int:
 
 def _shortened(value: Any) -> str:
     return repr(value)[:80]
-
-
-# === object row ===============================================================================================
-#
-# Make the row of an object's state, its columns by name: the fold makes it in three places, and it is the widest.
-
-
-def object_row(
-    id_: int,
-    process_metadata_id: int,
-    dtype: str,
-    name: str,
-    obj_type: str | None,
-    pose_id: int | None,
-    part_of_id: int | None,
-    identity_id: int | None,
-    time: int,
-    node_id: int | None,
-    joints: str | None = None,
-    description_fingerprint: str | None = None,
-    color: str | None = None,
-    model: str | None = None,
-    serial: str | None = None,
-    mass_kg: float | None = None,
-    base_link: str | None = None,
-) -> Row:
-    """Return the row; only the first one of an object has the columns from `joints` on.
-
-    Call it by position: a call by name would take half of the time of folding a moved object.
-    """
-    return (
-        id_,
-        process_metadata_id,
-        dtype,
-        name,
-        obj_type,
-        pose_id,
-        part_of_id,
-        identity_id,
-        time,
-        node_id,
-        joints,
-        description_fingerprint,
-        color,
-        model,
-        serial,
-        mass_kg,
-        base_link,
-    )
-
-
-assert cast("Any", object_row)(*COLUMNS["object"]) == COLUMNS["object"], "the number of columns differs"
-assert [each.rstrip("_") for each in object_row.__code__.co_varnames] == [*COLUMNS["object"]], "the order differs"
 
 
 # === observed values ==========================================================================================
@@ -435,8 +385,8 @@ def _object(event: StoredEvent, node: int, field: FieldDeclared, recorded: Any, 
     pose_id = own if value.pose is not None else None
     part_of = row_of(event.number, value.part_of.row) if value.part_of is not None else None
     number, time = event.number, microseconds(event.wall_ns)
-    columns = object_row(own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node)
-    others.append(("object", columns))
+    columns = (own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node)
+    others.append(("object", (*columns, *NOT_FIRST)))
     return own
 
 
