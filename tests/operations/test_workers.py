@@ -28,7 +28,7 @@ from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import FORKED, NOTES_PLAN, Started, answer, fork, pycrorm
-from tests.databases import ask, ask_to_change
+from tests.databases import ask
 from tests.projections.event_script import append_and_fold
 from tests.projections.rebuild_cases import TYPES, picking
 from tests.table_comparison import differences, tables_of
@@ -147,22 +147,6 @@ def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
     assert "exited" not in output
     assert "Traceback" not in output
     assert all(map(is_gone, pids))
-
-
-def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: Started) -> None:
-    assert noted(folder) == 3
-    ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE zz_task_tree_node__1001")
-    plan = Started("run", "notes.py", "--writer", "daemon", cwd=folder)
-    output = ""
-    while "cannot be brought" not in output:
-        output = daemon.stderr.readline()
-        assert output, "the daemon has ended"
-    ended = "SELECT count(*) FROM event WHERE type = 'NodeEnded'"
-    while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending continues
-        time.sleep(0.01)
-    plan.kill()
-    plan.communicate()
-    assert "no such table: zz_task_tree_node__1001" in output
 
 
 MANY = 12_000

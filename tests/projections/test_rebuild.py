@@ -17,7 +17,7 @@ from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
+from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.operations import rebuild as rebuilding
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.workers import Assignment
@@ -384,17 +384,6 @@ async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short(
 # --- bad input ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.soak_on("sqlite")
-async def test_only_one_process_rebuilds_at_a_time(database_url: str) -> None:
-    await append_and_fold(database_url, [*TYPES, *picking(1).records])
-    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
-    async with claimed(log):
-        with pytest.raises(CallerError, match="another `pycrorm rebuild` is running: wait for it to end"):
-            await rebuild_memory(database_url)
-    await log.close()
-    assert (await rebuild_memory(database_url)).generation == 1002
-
-
 async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str) -> None:
     await append_and_fold(database_url, [*TYPES, *picking(1).records])
     at = "memory_tables." if database_url.startswith("postgresql:") else ""
@@ -402,19 +391,6 @@ async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str
     with pytest.raises(DatabaseForeign, match=r"made by version 999 of the fold, this is version \d: use a newer"):
         await rebuild_memory(database_url)
     assert ask(database_url, "SELECT count(*) FROM pick_up_action") == [(5,)]
-
-
-@pytest.mark.soak_on("sqlite")
-async def test_tables_of_an_older_version_are_replaced(database_url: str) -> None:
-    await append_and_fold(database_url, [*TYPES, *picking(1).records])
-    before = tables_of(database_url)
-    at = "memory_tables." if database_url.startswith("postgresql:") else ""
-    ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 1")
-    with pytest.raises(DatabaseForeign, match="run `pycrorm rebuild`"):
-        await append_and_fold(database_url, [])
-    assert (await rebuild_memory(database_url)).generation == 1002
-    assert differences(before, tables_of(database_url)) == []
-    assert traces(database_url) == []
 
 
 async def test_a_database_without_a_memory_is_left_unchanged(tmp_path: Path, server: Server) -> None:

@@ -37,7 +37,6 @@ from tests.projections.verify_cases import (
     insertion,
     look,
     lost,
-    named,
     opened,
     parked,
     rebuilt,
@@ -287,15 +286,6 @@ async def test_an_episode_read_in_many_parts_has_the_same_findings_as_in_one(
     assert 20 < result.drift < 100
     assert findings(await in_parts(log, events, monkeypatch)) == findings(result)
     await log.close()
-
-
-async def test_a_missing_table_is_reported_in_one_line(log: EventLog, database_url: str) -> None:
-    ask_to_change(
-        database_url,
-        f"DROP TABLE {named(database_url, 'object_removal')} {'CASCADE' * database_url.startswith('postgresql:')}",
-    )
-    with pytest.raises(Exception, match="a table is missing: run `pycrorm rebuild`"):
-        await look(log)
 
 
 # --- concurrency ------------------------------------------------------------------------------------------------------

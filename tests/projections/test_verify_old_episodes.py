@@ -62,19 +62,6 @@ def test_where_an_episode_without_a_digest_differs_no_rebuild_is_recommended(dat
     assert answer("verify", "--url", f"sqlite:///{database}", cwd=tmp_path, code=1)["undecided"] == 1
 
 
-@pytest.mark.soak
-def test_where_an_episode_with_digests_differs_a_rebuild_is_recommended(tmp_path: Path) -> None:
-    url = unpack_memory(ZOO / "fold_8.tar.gz", tmp_path)
-    assert pycrorm("rebuild", "--url", url, cwd=tmp_path).returncode == 0
-    with sqlite3.connect(tmp_path / "memory.db") as connection:
-        names = "SELECT name FROM sqlite_master WHERE type = 'table' AND name LIKE '%pour_action%'"
-        [(table,)] = connection.execute(names)
-        connection.execute(f'UPDATE "{table}" SET litres = 9')
-    connection.close()
-    done = pycrorm("verify", "--url", url, cwd=tmp_path)
-    assert (done.returncode, "run `pycrorm rebuild`" in done.stdout.splitlines()[-1]) == (1, True)
-
-
 def test_a_tag_is_recorded_as_other_texts_are() -> None:
     assert checked_tags(["a\x00b", "a\udc80", "tab\t", "esc\x1b", "kitchen"]) == (
         "a\\x00b",
