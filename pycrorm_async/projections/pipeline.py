@@ -398,42 +398,29 @@ async def episodes_behind(
     connection: AsyncConnection,
     place: str,
     *,
-    after: int,
     limit: int,
+    after: int = 0,
     share: tuple[int, int] = (0, 1),
     after_tables: bool = False,
+    seen: str | None = None,
 ) -> list[EpisodeRow]:
     """Return the episodes above number `after` whose log is ahead of their checkpoint, limited to one share.
 
     With `after_tables`, only episodes whose first event is folded into the visible tables or parked, because that fold
-    decides whether an episode is a simulation.
+    decides whether an episode is a simulation. With `seen`, the SQL for the checkpoints of the visible tables (`SEEN`,
+    or `folded` of another generation), those of which the visible tables have more events; these are their `head`.
     """
+    head, joined = (
+        ("head", "") if seen is None else ("seen.folded", f"JOIN ({seen}) AS seen ON seen.number = episode.number")
+    )
     begun = "AND (episode.folded > 0 OR episode.parked IS NOT NULL)" if after_tables else ""
     rows = await connection.execute(
         text(f"""
-SELECT number, {dialect_of(connection).episode_id}, head, coalesce(progress.folded, 0), started_wall_ns
-FROM episode LEFT JOIN {place} AS progress ON progress.id = number
-WHERE number > :after AND head > coalesce(progress.folded, 0) AND progress.parked IS NULL
-AND number % :many = :part {begun} ORDER BY number LIMIT :limit"""),  # noqa: S608
+SELECT episode.number, {dialect_of(connection).episode_id}, {head}, coalesce(progress.folded, 0), started_wall_ns
+FROM episode {joined} LEFT JOIN {place} AS progress ON progress.id = episode.number
+WHERE episode.number > :after AND {head} > coalesce(progress.folded, 0) AND progress.parked IS NULL
+AND episode.number % :many = :part {begun} ORDER BY episode.number LIMIT :limit"""),  # noqa: S608
         {"after": after, "part": share[0], "many": share[1], "limit": limit},
-    )
-    return [EpisodeRow(*row) for row in rows]
-
-
-async def late(connection: AsyncConnection, place: str, *, seen: str, limit: int) -> list[EpisodeRow]:
-    """Return the episodes of which the visible tables have more events than this generation.
-
-    Their `head` is the last sequence in the visible tables. `seen` is the SQL for the checkpoints of those tables:
-    `SEEN`, or `folded` of another generation.
-    """
-    rows = await connection.execute(
-        text(f"""
-SELECT episode.number, {dialect_of(connection).episode_id}, seen.folded, coalesce(progress.folded, 0), started_wall_ns
-FROM episode JOIN ({seen}) AS seen ON seen.number = episode.number
-LEFT JOIN {place} AS progress ON progress.id = episode.number
-WHERE seen.folded > coalesce(progress.folded, 0) AND progress.parked IS NULL
-ORDER BY episode.number LIMIT :limit"""),  # noqa: S608
-        {"limit": limit},
     )
     return [EpisodeRow(*row) for row in rows]
 

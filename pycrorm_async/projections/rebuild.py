@@ -247,7 +247,7 @@ class Rebuild:
             seen = pipeline.SEEN
             if self._projection is not None:
                 seen = pipeline.folded(pipeline.place_of(old.number, self._projection.name) if old else self._place)
-            late = await pipeline.late(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
+            late = await pipeline.episodes_behind(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
