@@ -3,8 +3,8 @@
     log ──▶ fold ──▶ rows ──▶ projector ──▶ tables of a generation ──▶ public views ──▶ orm, query
 
 `columns` and `views` define the tables, `generations` creates them; `fold` turns events into rows and is pure;
-`pipeline` writes the rows of a batch together with its checkpoints, in one transaction; `projector` keeps the visible
-tables up to date;
+`pipeline` runs every fold: it writes the rows of a batch together with its checkpoints, in one transaction;
+`projector` keeps the visible tables up to date;
 `rebuild` and `verify` fold the log again, to replace the tables or to compare them; `custom` does all of this for
 projections that users write. Every table here can be dropped and rebuilt from the log.
 

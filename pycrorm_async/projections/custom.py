@@ -386,9 +386,6 @@ class EpisodeFolds:
         if len(self._open) > _EPISODES_MAX:
             self._open.popitem(last=False)
 
-    def __len__(self) -> int:
-        return len(self._open)
-
 
 # === packed projection ========================================================================================
 #

@@ -186,10 +186,10 @@ async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(
     await log.append([*declarations(PICK_UP), *(each for script in scripts for each in script.records[:4])])
     projector = await projector_of(log)
     await projector.catch_up()
-    assert list(map(len, kept)) == [4]
+    assert [len(each._open) for each in kept] == [4]
     await log.append([each for script in scripts for each in script.records])
     await projector.catch_up()
-    assert list(map(len, kept)) == [0]
+    assert [len(each._open) for each in kept] == [0]
     assert await rows_in(log) == [each for number in range(1, 8) for each in expected(number, tries)]
 
 
