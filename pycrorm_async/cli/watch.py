@@ -26,7 +26,7 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.show import tree_of
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.live.access import kept_token
-from pycrorm_async.live.follower import LogFollower
+from pycrorm_async.live.follower import LogFollower, wait_unless
 from pycrorm_async.query.replay import EpisodeReplay
 from pycrorm_async.query.snapshot import Moment, NodeThen, moment_of
 from pycrorm_async.store.log import episode_named
@@ -160,7 +160,7 @@ async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) ->
                     return
             except DatabaseUnavailable as error:
                 live.update(Text(visible(f"waiting: {error}")), refresh=True)
-            await _rest(stop, max(_INTERVAL_S, _SHARE * (time.monotonic() - began)))
+            await wait_unless(stop, asyncio.sleep(max(_INTERVAL_S, _SHARE * (time.monotonic() - began))))
 
 
 class _Drawing:
@@ -196,7 +196,7 @@ async def _wait_for(follower: LogFollower, name: str, live: Live, stop: asyncio.
             live.update(Text(f"{follower.address} has no episode yet: waiting for the first."), refresh=True)
         except DatabaseUnavailable as error:
             live.update(Text(visible(f"waiting: {error}")), refresh=True)
-        await _rest(stop, _INTERVAL_S * 2)
+        await wait_unless(stop, asyncio.sleep(_INTERVAL_S * 2))
     return None
 
 
@@ -257,12 +257,8 @@ async def draw_overview(follower: LogFollower, stop: asyncio.Event) -> None:
                 turn = follower.turn
                 overview = follower.overview  # another one if the database was replaced
                 live.update(_table(follower), refresh=True)
-                waiting = asyncio.ensure_future(follower.changed_since(turn, 1.0))
-                stopping = asyncio.ensure_future(stop.wait())
-                await asyncio.wait([waiting, stopping], return_when=asyncio.FIRST_COMPLETED)
-                for each in (waiting, stopping):
-                    each.cancel()
-                await _rest(stop, _INTERVAL_S)
+                await wait_unless(stop, follower.changed_since(turn, 1.0))
+                await wait_unless(stop, asyncio.sleep(_INTERVAL_S))
 
 
 def _table(follower: LogFollower) -> RenderableType:
@@ -281,11 +277,3 @@ def _table(follower: LogFollower) -> RenderableType:
     if follower.fault is not None:
         return Group(Text(visible(f"waiting: {follower.fault}"), style="yellow"), table)
     return table if entries else Group(Text("No episode runs; waiting for the next."), table)
-
-
-async def _rest(stop: asyncio.Event, seconds: float) -> None:
-    try:
-        async with asyncio.timeout(seconds):
-            await stop.wait()
-    except TimeoutError:
-        pass

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from typing import Any
@@ -247,6 +247,16 @@ class LogFollower:
         if self.overview.listeners:
             changed = await self.overview.catch_up(log, rows.values()) or changed
         return changed
+
+
+async def wait_unless(stop: asyncio.Event, waiting: Awaitable[Any]) -> None:
+    """Wait for something, or until `stop` is set; what still waits then is cancelled."""
+    tasks = [asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for each in tasks:
+            each.cancel()
 
 
 async def _close(overview: LiveOverview, log: EventLog | None) -> None:

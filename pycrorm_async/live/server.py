@@ -16,7 +16,7 @@ import html
 import math
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import nullcontext
 from errno import EACCES, EADDRINUSE
 from typing import Any
@@ -26,7 +26,7 @@ import msgspec
 from pycrorm_async import __version__
 from pycrorm_async.errors import CallerError, MissingExtra, PycrormError, UnknownEpisode
 from pycrorm_async.live.access import HEADERS, refusal
-from pycrorm_async.live.follower import OUTCOMES_S, EpisodeFeed, LogFollower
+from pycrorm_async.live.follower import OUTCOMES_S, EpisodeFeed, LogFollower, wait_unless
 from pycrorm_async.report.write import overview_page_of, page_of
 
 try:
@@ -180,7 +180,7 @@ class LiveServer:
                     yield _message("part", {"episodes": overview.entries(since)})
                     since = turn
                 yield self._state(None)
-                await self._rest(_LIST_INTERVAL_S)
+                await wait_unless(self._stopping, asyncio.sleep(_LIST_INTERVAL_S))
 
     async def _episode_stream(self, request: Request) -> Response:
         first, query = _number(request.query_params.get("from"), 1), request.query_params
@@ -220,18 +220,7 @@ class LiveServer:
         while not self._stopping.is_set():
             turn = self._follower.turn
             yield
-            await self._unless_stopped(self._follower.changed_since(turn, _ALIVE_S))
-
-    async def _rest(self, seconds: float) -> None:
-        await self._unless_stopped(asyncio.sleep(seconds))
-
-    async def _unless_stopped(self, waiting: Awaitable[Any]) -> None:
-        tasks = [asyncio.ensure_future(waiting), asyncio.ensure_future(self._stopping.wait())]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for each in tasks:
-                each.cancel()
+            await wait_unless(self._stopping, self._follower.changed_since(turn, _ALIVE_S))
 
     def _state(self, fault: str | None) -> str:
         follower = self._follower

@@ -128,24 +128,32 @@ NODES_MAX = 500
 
 def shown_nodes(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     """Return the nodes that a view shows: at most half of them lead to failures, the others are nearest to the root."""
+    return _part(nodes, root_failures(nodes), sorted(nodes, key=lambda each: each.depth))
+
+
+def _part(
+    nodes: Sequence[NodeSummary], failures: Sequence[NodeSummary], others: Sequence[NodeSummary]
+) -> list[NodeSummary]:
+    """Return all nodes, or of many those that a view has room for: failures up to half of it, then others."""
     if len(nodes) <= NODES_MAX:
         return list(nodes)
     by_id = {each.id: each for each in nodes}
-    depths: dict[int, int] = {}
-    for each in nodes:
-        depths[each.id] = depths.get(each.parent_id, -1) + 1 if each.parent_id is not None else 0
     kept: set[int] = set()
-    for each in root_failures(nodes):
-        path = {each.id}
-        while (parent := each.parent_id) in by_id and parent is not None:
-            path.add(parent)
-            each = by_id[parent]
-        if len(kept | path) > NODES_MAX // 2:
-            break
-        kept |= path
-    nearest = sorted((each.id for each in nodes if each.id not in kept), key=lambda number: depths[number])
-    kept.update(nearest[: NODES_MAX - len(kept)])
+    _keep(kept, failures, by_id, NODES_MAX // 2)
+    _keep(kept, others, by_id, NODES_MAX)
     return [each for each in nodes if each.id in kept]
+
+
+def _keep(kept: set[int], chosen: Sequence[NodeSummary], by_id: Mapping[int, NodeSummary], nodes_max: int) -> None:
+    """Add the chosen nodes, each with its ancestors, as far as they fit."""
+    for each in chosen:
+        path: set[int] = set()
+        node: NodeSummary | None = each
+        while node is not None and node.id not in kept and len(kept) + len(path) <= nodes_max:
+            path.add(node.id)
+            node = by_id.get(node.parent_id) if node.parent_id is not None else None
+        if len(kept) + len(path) <= nodes_max:
+            kept |= path
 
 
 def root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
@@ -231,27 +239,10 @@ def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
 
 def _sample(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     """Return all nodes, or of many some that are spread over the whole episode, always the same ones."""
-    if len(nodes) <= NODES_MAX:
-        return list(nodes)
     lot = Random(0)  # noqa: S311  no secret: a seed draws the same chart again
-    by_id = {each.id: each for each in nodes}
-    kept: set[int] = set()
     failures = root_failures(nodes)
-    _keep(kept, lot.sample(failures, min(len(failures), _DRAWS_MAX)), by_id, NODES_MAX // 2)
-    _keep(kept, lot.sample(nodes, min(len(nodes), _DRAWS_MAX)), by_id, NODES_MAX)
-    return [each for each in nodes if each.id in kept]
-
-
-def _keep(kept: set[int], chosen: Sequence[NodeSummary], by_id: Mapping[int, NodeSummary], nodes_max: int) -> None:
-    """Add the chosen nodes, each with its ancestors, as far as they fit."""
-    for each in chosen:
-        path: set[int] = set()
-        node: NodeSummary | None = each
-        while node is not None and node.id not in kept and len(kept) + len(path) <= nodes_max:
-            path.add(node.id)
-            node = by_id.get(node.parent_id) if node.parent_id is not None else None
-        if len(kept) + len(path) <= nodes_max:
-            kept |= path
+    drawn = (lot.sample(each, min(len(each), _DRAWS_MAX)) for each in (failures, nodes))
+    return _part(nodes, *drawn)
 
 
 def _note(drawn: Sequence[NodeSummary], nodes: Sequence[NodeSummary]) -> str:
