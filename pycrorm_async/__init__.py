@@ -20,13 +20,14 @@ from pycrorm_async.moved_modules import keep_former_paths
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
     from pycrorm_async.events.types import Blob
-    from pycrorm_async.memory import Memory, MemoryStatus, with_tree
+    from pycrorm_async.memory import Memory, MemoryStatus
     from pycrorm_async.operations.recovery import recover
     from pycrorm_async.projections.custom import EpisodeProjection, Projection
     from pycrorm_async.projections.mapped_tables import UserView
     from pycrorm_async.query.again import performable_of, world_of
     from pycrorm_async.query.reading import Reading
     from pycrorm_async.record.event_feed import RecordedEvent
+    from pycrorm_async.record.plan_recorder import with_tree
     from pycrorm_async.settings import Settings
 
 __version__ = "0.2.0.dev0"
@@ -61,7 +62,7 @@ _MODULES = {
     "UserView": "projections.mapped_tables",
     "performable_of": "query.again",
     "recover": "operations.recovery",
-    "with_tree": "memory",
+    "with_tree": "record.plan_recorder",
     "world_of": "query.again",
 }
 

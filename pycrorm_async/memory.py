@@ -21,7 +21,6 @@ of that database stores them.
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 import os
 import threading
@@ -63,7 +62,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import AskedEpisode, Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading, memory_html
-from pycrorm_async.query.success import Kind, Source, success_figure, success_samples
+from pycrorm_async.query.success import plot_success
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
@@ -73,7 +72,7 @@ from pycrorm_async.recall.recall import CaseReader, DatabaseSource, ProcessCases
 from pycrorm_async.record.declarations import KnownTypes
 from pycrorm_async.record.episode_writer import Emitter, Faults, OpenEpisodes, PlanSource, Provenance, read_labels
 from pycrorm_async.record.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
-from pycrorm_async.record.plan_recorder import Episode, Recorder, current_episode
+from pycrorm_async.record.plan_recorder import Episode, Recorder
 from pycrorm_async.record.plan_types import built_in_declaration
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import Missing
@@ -86,9 +85,6 @@ from pycrorm_async.world.bullet import watcher
 from pycrorm_async.writer.plan_writer import DelegatedWriter, WriterState, WriterThread
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
     from pycrorm_async.export.export import ExportComparison, Exported, FileFormat
     from pycrorm_async.export.lerobot import ImageSize
     from pycrorm_async.export.scenes import Clock as StateClock
@@ -97,12 +93,10 @@ if TYPE_CHECKING:
 
 
 # === memory parts =============================================================================================
-#
-# Hold the parts of an open memory, connect plans to them in one context or the whole process, report their state.
 
 
 class Parts(NamedTuple):
-    """The parts of an open memory."""
+    """The parts of an open memory, to which plans are connected in one context or in the whole process."""
 
     queue: RecorderQueue
     writer: WriterThread | DelegatedWriter
@@ -412,7 +406,7 @@ class Memory:
         text = description or plan or "an episode"
         labels = read_labels(tags, metadata, parts.emitter)
         with parts.in_context():
-            async with _episode_of(parts.recorder, description=text, plan=plan, seed=seed, labels=labels) as episode:
+            async with parts.recorder.episode(description=text, plan=plan, seed=seed, labels=labels) as episode:
                 yield episode
 
     async def tag(self, episode: AskedEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
@@ -549,6 +543,7 @@ class Memory:
     diff = _reading(Reading.diff)
     blob = _reading(Reading.blob)
     number_of = _reading(Reading.number_of)
+    plot_success = _reading(plot_success)
 
     @property
     def ask(self) -> Ask[Question]:
@@ -635,36 +630,6 @@ class Memory:
         from pycrorm_async.export.export import export_again
 
         return await export_again(self.reading, manifest, path, statement=statement, force=force)
-
-    async def plot_success(
-        self,
-        x: str,
-        y: str,
-        *,
-        of: Source = "PickUpWithContextView",
-        kind: Kind = "auto",
-        bins: int | None = None,
-        axes: Axes | None = None,
-    ) -> Figure:
-        """Draw how often the actions of a view succeeded over two of its columns, up to the last flush.
-
-        >>> figure = await memory.plot_success("relative_x", "relative_y")  # pick-ups, as in the thesis' figure 5.1
-        >>> figure.savefig("pick-ups.svg")
-        >>> await memory.plot_success("arm", "duration", of=PickUpAction, axes=axes)
-
-        Args:
-            x, y: names of columns: numbers, times, texts, enums or bools.
-            of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
-                `status`.
-            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval in cells that are
-                large enough; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
-            bins: the largest number of ranges of a numeric column; by default it grows with the number of rows.
-            axes: draw into these instead of a new figure.
-
-        It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
-        """
-        samples = await success_samples(self.reading, x, y, of)
-        return success_figure(samples, kind=kind, bins=bins, axes=axes)
 
     # --- opening and closing ----------------------------------------------------------------------------------
 
@@ -933,52 +898,3 @@ class SyncMemory:
     picture = _awaited(Memory.picture)
     plot_success = _awaited(Memory.plot_success)
     export = _awaited(Memory.export)
-
-
-# === with tree ================================================================================================
-
-
-@asynccontextmanager
-async def _episode_of(own: Recorder, **opening: Any) -> AsyncIterator[Episode]:
-    """Record an episode in this context; the arguments are those of `Recorder.open_episode`."""
-    if (room := own.admit()) is not None:
-        await room
-    episode = own.open_episode(**opening)
-    failure: BaseException | None = None
-    with set_inside(current_episode, episode), set_inside(called_performs, episode.calls):
-        try:
-            yield episode
-        except BaseException as raised:
-            failure = raised
-            raise
-        finally:
-            own.close_episode(episode, failure)
-
-
-def with_tree(plan: Callable[_P, Coroutine[Any, Any, T]]) -> Callable[_P, Coroutine[Any, Any, T]]:
-    """Record each call of a plan as one episode in the open memory, unless an episode is open already.
-
-    >>> @with_tree
-    ... async def plan():
-    ...     with simulated_robot:
-    ...         await ParkArmsActionPerformable(Arms.BOTH).perform()
-    >>> await plan()
-
-    The episode is named by the first line of the plan's docstring, or else by its name. Without an open memory the plan
-    is only performed. Raises `CallerError` for a function that is not `async def`.
-    """
-    if not inspect.iscoroutinefunction(plan):
-        raise CallerError(f"with_tree needs an `async def`, got {plan!r:.100}")
-    named_plan = plan.func if isinstance(plan, partial) else plan
-    name = named_plan.__name__
-    description = (inspect.getdoc(named_plan) or name).partition("\n")[0]
-
-    @wraps(plan)
-    async def performed(*arguments: _P.args, **named: _P.kwargs) -> T:
-        own = recorder.get()
-        if not isinstance(own, Recorder) or own.is_closed or own.episode_here() is not None:
-            return await plan(*arguments, **named)
-        async with _episode_of(own, description=description, plan=name):
-            return await plan(*arguments, **named)
-
-    return performed

@@ -508,3 +508,37 @@ def _round_step(width: float) -> float:
     """Return the least of 1, 2, 2.5, 5 and 10, times a power of ten, that is not below the width."""
     power = 10.0 ** math.floor(math.log10(width))
     return next((factor * power for factor in (1, 2, 2.5, 5) if factor * power >= width * (1 - 1e-9)), 10 * power)
+
+
+# === plot =====================================================================================================
+
+
+async def plot_success(
+    reading: Reading,
+    x: str,
+    y: str,
+    *,
+    of: Source = PICK_UPS,
+    kind: Kind = "auto",
+    bins: int | None = None,
+    axes: Axes | None = None,
+) -> Figure:
+    """Draw how often the actions of a view succeeded over two of its columns, up to the last flush.
+
+    >>> figure = await memory.plot_success("relative_x", "relative_y")  # pick-ups, as in the thesis' figure 5.1
+    >>> figure.savefig("pick-ups.svg")
+    >>> await memory.plot_success("arm", "duration", of=PickUpAction, axes=axes)
+
+    Args:
+        x, y: names of columns: numbers, times, texts, enums or bools.
+        of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
+            `status`.
+        kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval in cells that are
+            large enough; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
+        bins: the largest number of ranges of a numeric column; by default it grows with the number of rows.
+        axes: draw into these instead of a new figure.
+
+    It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
+    """
+    samples = await success_samples(reading, x, y, of)
+    return success_figure(samples, kind=kind, bins=bins, axes=axes)

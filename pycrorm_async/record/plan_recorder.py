@@ -18,13 +18,18 @@ the node's episode, and it takes no lock.
 
 from __future__ import annotations
 
+import inspect
 import math
 import threading
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
+from contextlib import asynccontextmanager
 from contextvars import ContextVar
-from typing import Any, Final, Literal, NamedTuple
+from functools import partial, wraps
+from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
+from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import (
+    CallerError,
     DeclarationRefused,
     EpisodeFull,
     EpisodeRefused,
@@ -51,7 +56,7 @@ from pycrorm_async.events.types import (
     SeenValue,
     StateSampled,
 )
-from pycrorm_async.plan.execution import CalledPerforms, Search, Seen, Simulation, current_simulation
+from pycrorm_async.plan.execution import CalledPerforms, Search, Seen, Simulation, called_performs, current_simulation
 from pycrorm_async.plan.execution import recorder as plan_observer
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
@@ -205,6 +210,22 @@ class Recorder:
         return self._emitter.is_closed
 
     # --- episodes ---------------------------------------------------------------------------------------------
+
+    @asynccontextmanager
+    async def episode(self, **opening: Any) -> AsyncIterator[Episode]:
+        """Record an episode in this context; the arguments are those of `open_episode`."""
+        if (room := self.admit()) is not None:
+            await room
+        episode = self.open_episode(**opening)
+        failure: BaseException | None = None
+        with set_inside(current_episode, episode), set_inside(called_performs, episode.calls):
+            try:
+                yield episode
+            except BaseException as raised:
+                failure = raised
+                raise
+            finally:
+                self.close_episode(episode, failure)
 
     def open_episode(self, *, description: str, **arguments: Any) -> Episode:
         """Open an episode in this context; `close_episode` ends it. `Recording.opening` has the arguments.
@@ -467,6 +488,39 @@ def _description_of(simulation: Simulation) -> str:
     if simulation.by is not None and simulation.by.designator is not None:
         return f"simulation in {simulation.by.designator.__dtype__}"
     return "simulation"
+
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def with_tree(plan: Callable[_P, Coroutine[Any, Any, _T]]) -> Callable[_P, Coroutine[Any, Any, _T]]:
+    """Record each call of a plan as one episode in the open memory, unless an episode is open already.
+
+    >>> @with_tree
+    ... async def plan():
+    ...     with simulated_robot:
+    ...         await ParkArmsActionPerformable(Arms.BOTH).perform()
+    >>> await plan()
+
+    The episode is named by the first line of the plan's docstring, or else by its name. Without an open memory the plan
+    is only performed. Raises `CallerError` for a function that is not `async def`.
+    """
+    if not inspect.iscoroutinefunction(plan):
+        raise CallerError(f"with_tree needs an `async def`, got {plan!r:.100}")
+    named_plan = plan.func if isinstance(plan, partial) else plan
+    name = named_plan.__name__
+    description = (inspect.getdoc(named_plan) or name).partition("\n")[0]
+
+    @wraps(plan)
+    async def performed(*arguments: _P.args, **named: _P.kwargs) -> _T:
+        own = plan_observer.get()
+        if not isinstance(own, Recorder) or own.is_closed or own.episode_here() is not None:
+            return await plan(*arguments, **named)
+        async with own.episode(description=description, plan=name):
+            return await plan(*arguments, **named)
+
+    return performed
 
 
 # === episode events ===========================================================================================
