@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+import pycrorm_async.world as worlds
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
 from pycrorm_async.world.bullet_body import WorldState
@@ -363,21 +364,19 @@ def test_importing_the_package_does_not_import_bullet_or_numpy() -> None:
 
 
 def test_every_public_name_exists() -> None:
-    done = run(
-        "import pycrorm_async.world as world\n"
-        "for name in world.__all__:\n"
-        "    getattr(world, name)\n"
-        "assert dir(world) == sorted(world.__all__)\n"
-        "try:\n    world.nothing\nexcept AttributeError as refused:\n    print(refused)\n"
-    )
-    assert done.stdout == b"module 'pycrorm_async.world' has no attribute 'nothing'\n"
-    assert done.returncode == 0
+    assert [name for name in worlds.__all__ if not hasattr(worlds, name)] == []
+    assert dir(worlds) == sorted(worlds.__all__)
+    with pytest.raises(AttributeError, match=r"^module 'pycrorm_async\.world' has no attribute 'nothing'$"):
+        _ = worlds.nothing
 
 
-def test_nothing_of_bullet_reaches_stdout_or_stderr() -> None:
-    """Neither its greeting nor its warnings about a link without inertia or an unreadable mesh are printed."""
+def test_nothing_of_bullet_reaches_stdout_or_stderr_and_those_of_c_and_cpp_are_the_real_ones_afterwards() -> None:
+    """Neither its greeting nor its warnings about a link without inertia or an unreadable mesh are printed.
+
+    The C++ runtime is loaded with Bullet: it must not keep the memory that replaced stdout meanwhile.
+    """
     done = run(
-        "import tempfile\n"
+        "import ctypes, tempfile\n"
         "from pycrorm_async.world import *\n"
         "from pycrorm_async.world.pose import DescriptionNotLoadable\n"
         "print('before')\n"
@@ -389,9 +388,15 @@ def test_nothing_of_bullet_reaches_stdout_or_stderr() -> None:
         "    for shape in (f'<mesh filename=\"{empty.name}\"/>', '<box/>'):\n"
         "        try:\n            Object('bad', ObjectType.GENERIC_OBJECT, link.format(shape))\n"
         "        except DescriptionNotLoadable:\n            print('refused')\n"
-        "print('after')\n"
+        "print('after', flush=True)\n"
+        "ctypes.CDLL(None).printf(b'C\\n')\n"
+        "ctypes.CDLL(None).fflush(None)\n"
+        "cpp = ctypes.CDLL('libstdc++.so.6')\n"
+        "cout = ctypes.c_void_p(ctypes.addressof(ctypes.c_char.in_dll(cpp, '_ZSt4cout')))\n"
+        "cpp._ZNSo3putEc(cout, ctypes.c_char(b'+'))\n"
+        "cpp._ZNSo5flushEv(cout)\n"
     )
-    assert (done.stdout, done.stderr, done.returncode) == (b"before\nrefused\nrefused\nafter\n", b"", 0)
+    assert (done.stdout, done.stderr, done.returncode) == (b"before\nrefused\nrefused\nafter\nC\n+", b"", 0)
 
 
 def test_output_of_other_threads_meanwhile_is_not_swallowed() -> None:
@@ -414,20 +419,3 @@ def test_output_of_other_threads_meanwhile_is_not_swallowed() -> None:
     )
     assert done.stdout == b"spoken\n" * int(done.stderr)
     assert int(done.stderr) > 0
-
-
-def test_the_streams_of_c_and_cpp_are_the_real_ones_afterwards() -> None:
-    """The C++ runtime is loaded with Bullet: it must not keep the memory that replaced stdout meanwhile."""
-    done = run(
-        "import ctypes\n"
-        "from pycrorm_async.world import *\n"
-        "with BulletWorld():\n"
-        "    Object('milk', ObjectType.MILK)\n"
-        "ctypes.CDLL(None).printf(b'C\\n')\n"
-        "ctypes.CDLL(None).fflush(None)\n"
-        "cpp = ctypes.CDLL('libstdc++.so.6')\n"
-        "cout = ctypes.c_void_p(ctypes.addressof(ctypes.c_char.in_dll(cpp, '_ZSt4cout')))\n"
-        "cpp._ZNSo3putEc(cout, ctypes.c_char(b'+'))\n"
-        "cpp._ZNSo5flushEv(cout)\n"
-    )
-    assert (done.stdout, done.stderr, done.returncode) == (b"C\n+", b"", 0)
