@@ -26,7 +26,7 @@ _MAY_BE_NONE = frozenset({"sample_interval_ms"})
 _MAY_BE_ZERO = frozenset({"keep_stored_bytes", "keep_stored_s", "sample_change_min"})
 _EPISODE_EVENTS = range(100, 2**26)
 """Bounds `episode_events_max`: a sequence has 26 bits (`events.ids.SEQUENCE_MAX`); a plan needs about 100 events."""
-_REMOVED = ("batch_bytes_max", "batch_age_ms", "fold_worker_restart_s")
+_REMOVED = ("batch_bytes_max", "batch_age_ms", "fold_worker_restart_s", "fold_worker_answer_s")
 _log = logging.getLogger("pycrorm_async")
 _CHOICES = {
     "writer": get_args(Writer),
@@ -106,6 +106,7 @@ class Settings:
     batch_bytes_max: InitVar[object] = None
     batch_age_ms: InitVar[object] = None
     fold_worker_restart_s: InitVar[object] = None
+    fold_worker_answer_s: InitVar[object] = None
 
     def changed(self) -> dict[str, Any]:
         """Return the settings that differ from their defaults, by name."""
