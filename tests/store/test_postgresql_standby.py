@@ -139,11 +139,6 @@ def run_tool(server: Server, tool: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def _unavailable(memory: Memory) -> str | None:
-    writer = memory.status.writer
-    return None if writer is None else writer.queue.unavailable
-
-
 class Backup:
     """A backup of a database by the server's own tools."""
 
@@ -206,25 +201,6 @@ async def test_a_database_whose_keys_are_not_restored_yet_is_unavailable(databas
     with pytest.raises(DatabaseUnavailable, match="a part of the memory is missing; restore it from a backup"):
         await log.append(run_of(episode(1), 3, 4))
     await log.close()
-
-
-async def test_a_memory_continues_after_its_schemas_were_dropped_and_restored_while_it_recorded(
-    server: Server, database_url: str, tmp_path: Path
-) -> None:
-    opening = Memory.open(database_url, spool=tmp_path / "spool", settings=SETTINGS)
-    async with opening as memory, memory.episode(description="restored"):
-        await StepActionPerformable("a", 1).perform()
-        await memory.flush()
-        backup = await asyncio.to_thread(Backup, server, database_url, tmp_path / "backup")
-        await asyncio.to_thread(ask, database_url, DROP)
-        await StepActionPerformable("a", 2).perform()
-        flushing = asyncio.create_task(memory.flush())
-        while _unavailable(memory) is None and not flushing.done():  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
-        assert not flushing.done()
-        await asyncio.to_thread(backup.restore)
-        await flushing
-    assert ask(database_url, "SELECT step FROM step_action ORDER BY step") == [(1,), (2,)]
 
 
 GONE: dict[str, Callable[[Backup], None]] = {
