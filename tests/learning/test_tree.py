@@ -19,8 +19,6 @@ from pycrorm_async.learning.policy import (
     Evidence,
     PickUpChoice,
     Policy,
-    Rectangle,
-    Region,
     default_policy,
 )
 from pycrorm_async.learning.tree import learn
@@ -107,21 +105,6 @@ def test_the_leaves_equal_those_of_pyjpt_in_order_and_to_the_digit(learned: Poli
     ours = [(each.weight, each.arms, each.grasps, each.x.knots, each.y.knots) for each in learned.leaves]  # type: ignore[union-attr]
     assert len(ours) > 5
     assert ours == theirs
-
-
-def test_probabilities_and_conditioned_ones_equal_those_of_pyjpt(learned: Policy, oracle: Any) -> None:
-    from jpt.base.intervals import ContinuousSet
-
-    for x_min, x_max, y_min, y_max in [(-0.8, 0.0, -0.5, 0.5), (0.3, 0.7, 0.0, 1.0), (-1.0, 1.0, -0.8, -0.3)]:
-        in_region = Evidence(region=Region((Rectangle(x_min, x_max, y_min, y_max),)))
-        query = {"object_x": ContinuousSet(x_min, x_max), "object_y": ContinuousSet(y_min, y_max)}
-        assert learned.probability(in_region) == pytest.approx(oracle.infer(query), rel=1e-6)
-        conditioned = oracle.conditional_jpt(query)
-        ours = learned.condition(in_region)
-        for grasp in (Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT):
-            expected = conditioned.infer({"arm": "LEFT", "grasp": grasp.name})
-            conditions = Evidence(arms=frozenset({Arms.LEFT}), grasps=frozenset({grasp}))
-            assert ours.probability(conditions) == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
 def test_learning_again_yields_the_same_policy(learned: Policy, successes: list[PickUpChoice]) -> None:
