@@ -43,9 +43,6 @@ from pycrorm_async.events.fields import (
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.store.dialect import Expected
 
-#
-# List the columns of the tables that every memory has.
-
 Storage: TypeAlias = Literal[
     "key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json", "bytes", "number"
 ]
@@ -427,6 +424,7 @@ INDEXED = {
     "observation": ("process_metadata_id", "node_id", "name"),
     "observation_value": ("process_metadata_id",),
 }
+"""The indexed columns of the tables that every memory has; `schema.json` has those of these that a class maps."""
 
 _FURTHER = {("task_tree_node", "dtype"): ("status",), ("episode_tagging", "tag"): (EPISODE,)}
 """Further key columns of an index, after its first: learning queries filter the nodes of a type by status, and

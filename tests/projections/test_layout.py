@@ -212,6 +212,7 @@ def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:
     assert changed(before.with_declaration(shouting)) == {"shouting_action", "saying_action", "designator"}
 
 
+@pytest.mark.slow
 def test_a_changed_table_or_view_is_noticed_and_a_changed_table_raises_the_version() -> None:
     before = FILE.read_text().splitlines()
     tables = {each for each in changed(before) if each.startswith("table ")}
