@@ -166,7 +166,8 @@ COMPUTED: Final = {"storage": None}
 """Marks a column of a view that its select computes, so that the table behind the view does not have it.
 
 The `info` of another column may name its `storage`, if its type does not say it, and the column that it comes `after`
-in the table, if that is not the one before it in the class. `projections/schema.json` is made from both.
+in the table, if that is not the one before it in the class. `projections/schema.json` is made from both, and has the
+tables of the classes with an indexed column; other classes map views that compute all their rows.
 """
 
 

@@ -22,7 +22,7 @@ from sqlalchemy import Table
 
 from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment, is_built_in, view_mappers
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion
-from pycrorm_async.projections.columns import INDEXED, SCHEMA_FILE, Schema, Storage
+from pycrorm_async.projections.columns import SCHEMA_FILE, Schema, Storage
 from pycrorm_async.projections.mapped_tables import column_storage, leaves_of
 
 _TIME = "µs since 1970-01-01 00:00 UTC"
@@ -185,8 +185,12 @@ _REFERENCES: dict[str, Storage] = {"process_metadata.id": "number", "task_tree_n
 def schema() -> Schema:
     """Return the built-in tables and the texts of their views as the mapped classes declare them."""
     views = {each.name: each for each in described().values() if each.built_in}
+    tables = {name: mapper.local_table.columns for name, mapper in view_mappers().items() if name in views}
+    indexed = {name: [each.name for each in columns if each.index] for name, columns in sorted(tables.items())}
+    indexed = {name: columns for name, columns in indexed.items() if columns}  # a view that computes has no table
     return Schema(
-        {name: _columns_of(name) for name in INDEXED if name in views},
+        {name: _columns_of(name) for name in indexed},
+        indexed,
         [each for each in leaves_of(Designator) if each.dtype is not None],
         {name: {"": each.text, **each.columns} for name, each in views.items()},
     )

@@ -32,7 +32,7 @@ class ProcessMetaData(Base):
     _unmapped: ClassVar[dict[str, dict[str, str]]] = {"entered_world": {"storage": "text", "after": "clock_error_us"}}
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    uuid: Mapped[str]
+    uuid: Mapped[str] = mapped_column(index=True)
     created_at: Mapped[datetime]
     """Its start."""
     created_by: Mapped[str]
@@ -57,7 +57,7 @@ class ProcessMetaData(Base):
     failure_message: Mapped[str | None]
     simulated: Mapped[bool]
     """True for a simulation, performed in a copy of the world."""
-    thought_by: Mapped[str | None]
+    thought_by: Mapped[str | None] = mapped_column(index=True)
     """UUID of the episode that performed this simulation."""
     thought_by_node: Mapped[int | None]
     """The sequence, in that episode, of the node that performed this simulation."""
@@ -155,7 +155,7 @@ class Pose(RowOfEvent, Base):
     __tablename__ = "pose"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     time: Mapped[datetime] = mapped_column(info={"after": "qw"})
     frame: Mapped[str] = mapped_column(info={"after": "qw"})
     position_id: Mapped[int] = mapped_column(ForeignKey("position.id"), info=COMPUTED)

@@ -210,12 +210,12 @@ class Object(RowOfEvent, Base):
     __tablename__ = "object"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     dtype: Mapped[str]
     name: Mapped[str]
-    obj_type: Mapped[ObjectType | None]
+    obj_type: Mapped[ObjectType | None] = mapped_column(index=True)
     pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
-    identity_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    identity_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"), index=True)
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
     joints: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
@@ -288,9 +288,9 @@ class ObjectRemoval(RowOfEvent, Base):
     __tablename__ = "object_removal"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
-    identity_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    identity_id: Mapped[int] = mapped_column(ForeignKey("object.id"), index=True)
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
 
@@ -304,10 +304,10 @@ class Attachment(RowOfEvent, Base):
     __tablename__ = "attachment"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     kind: Mapped[str]
     parent_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
-    child_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    child_id: Mapped[int] = mapped_column(ForeignKey("object.id"), index=True)
     link: Mapped[str | None]
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
@@ -324,8 +324,8 @@ class JointChange(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     joint: Mapped[str] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"), index=True)
     position: Mapped[float]
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
@@ -373,7 +373,7 @@ class ParameterItem(RowOfEvent, Base):
     node_id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
     field: Mapped[str] = mapped_column(primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     key: Mapped[str | None]
     integer: Mapped[int | None]
     real: Mapped[float | None]
@@ -664,12 +664,12 @@ class TaskTreeNode(RowOfEvent, Base):
     }
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    parent_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    parent_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
     action_id: Mapped[int | None] = mapped_column(ForeignKey("designator.id"), info=COMPUTED)
     kind: Mapped[str]
-    dtype: Mapped[str | None]
-    status: Mapped[TaskStatus]
+    dtype: Mapped[str | None] = mapped_column(index=True)
+    status: Mapped[TaskStatus] = mapped_column(index=True)
     start_time: Mapped[datetime]
     end_time: Mapped[datetime | None] = mapped_column(info=COMPUTED)
     start_ns: Mapped[int]
@@ -719,7 +719,7 @@ class LocationCandidate(RowOfEvent, Base):
 
     resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
@@ -749,7 +749,7 @@ class LocationRefusal(RowOfEvent, Base):
 
     resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
@@ -783,8 +783,8 @@ class LocationResolution(RowOfEvent, Base):
     __tablename__ = "location_resolution"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
     location: Mapped[str]
     considered: Mapped[int]
     offered: Mapped[int]
@@ -836,8 +836,8 @@ class Detection(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
     source: Mapped[str]
     looked_for: Mapped[ObjectType | None]
     object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
@@ -874,9 +874,9 @@ class StateSample(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     channel: Mapped[str] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
     value: Mapped[float]
     time: Mapped[datetime]
     ns: Mapped[int]
@@ -895,9 +895,9 @@ class Observation(RowOfEvent, Base):
     __tablename__ = "observation"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
-    name: Mapped[str]
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
+    name: Mapped[str] = mapped_column(index=True)
     time: Mapped[datetime]
     ns: Mapped[int]
 
@@ -929,7 +929,7 @@ class ObservationValue(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(ForeignKey("observation.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     key: Mapped[str]
     number: Mapped[float | None]
     text: Mapped[str | None]

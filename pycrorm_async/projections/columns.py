@@ -72,11 +72,13 @@ class Schema(msgspec.Struct, frozen=True):
 
     Attributes:
         tables: columns of each table that a class maps, in the order in which the fold writes their values.
+        indexed: the columns by which queries filter and join these tables.
         leaves: tables of the built-in designators.
         comments: texts by view and column, which PostgreSQL keeps; the text under the empty name is the view's own.
     """
 
     tables: dict[str, dict[str, Storage]]
+    indexed: dict[str, list[str]]
     leaves: list[Leaf]
     comments: dict[str, dict[str, str]]
 
@@ -406,26 +408,6 @@ _TEXT_KEYS = {
     (LINK_BOX, "model"),
 }
 
-INDEXED = {
-    "process_metadata": ("uuid", "thought_by"),
-    "episode_tagging": ("process_metadata_id", "tag"),
-    "task_tree_node": ("process_metadata_id", "parent_id", "status", "dtype"),
-    "pose": ("process_metadata_id",),
-    "object": ("process_metadata_id", "identity_id", "obj_type"),
-    "object_removal": ("process_metadata_id", "identity_id"),
-    "parameter_item": ("process_metadata_id",),
-    "attachment": ("process_metadata_id", "child_id"),
-    "joint_change": ("process_metadata_id", "object_id"),
-    "location_resolution": ("process_metadata_id", "node_id"),
-    "location_candidate": ("process_metadata_id",),
-    "location_refusal": ("process_metadata_id",),
-    "detection": ("process_metadata_id", "node_id"),
-    "state_sample": ("process_metadata_id", "node_id"),
-    "observation": ("process_metadata_id", "node_id", "name"),
-    "observation_value": ("process_metadata_id",),
-}
-"""The indexed columns of the tables that every memory has; `schema.json` has those of these that a class maps."""
-
 _FURTHER = {("task_tree_node", "dtype"): ("status",), ("episode_tagging", "tag"): (EPISODE,)}
 """Further key columns of an index, after its first: learning queries filter the nodes of a type by status, and
 `episode_tag` looks for later changes of a tag of the same episode."""
@@ -522,7 +504,7 @@ def leaf_columns(columns: dict[str, Storage]) -> dict[str, Storage]:
 def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:
     """Return the indexed columns: of a core table those that queries filter and join by, of a leaf its objects."""
     if name in CORE:
-        return INDEXED.get(name, ())
+        return (EPISODE, "tag") if name == "episode_tagging" else tuple(SCHEMA.indexed.get(name, ()))
     return tuple(column for column, storage in columns.items() if storage == "object")
 
 
