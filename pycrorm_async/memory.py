@@ -70,8 +70,9 @@ from pycrorm_async.recall.answer import Answer
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, ProcessCases, Recall
 from pycrorm_async.record.declarations import KnownTypes
-from pycrorm_async.record.episode_writer import Emitter, Faults, OpenEpisodes, PlanSource, Provenance, read_labels
+from pycrorm_async.record.episode_writer import Emitter, Faults, OpenEpisodes
 from pycrorm_async.record.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
+from pycrorm_async.record.opening import PlanSource, Provenance, read_labels
 from pycrorm_async.record.plan_recorder import Episode, Recorder
 from pycrorm_async.record.plan_types import built_in_declaration
 from pycrorm_async.record.recording import Recording
@@ -404,7 +405,7 @@ class Memory:
         """
         parts = self._open_parts
         text = description or plan or "an episode"
-        labels = read_labels(tags, metadata, parts.emitter)
+        labels = read_labels(tags, metadata, self._settings, parts.emitter.missing)
         with parts.in_context():
             async with parts.recorder.episode(description=text, plan=plan, seed=seed, labels=labels) as episode:
                 yield episode

@@ -17,7 +17,7 @@ from pycrorm_async.projections.columns import CORE, OF_NO_EPISODE, Layout, leaf_
 from pycrorm_async.projections.generations import built_in_texts, table_texts
 from pycrorm_async.projections.mapped_tables import mapped_leaves
 from pycrorm_async.projections.views import Tables
-from pycrorm_async.record.episode_writer import Provenance
+from pycrorm_async.record.opening import Provenance
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of

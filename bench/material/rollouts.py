@@ -39,7 +39,8 @@ from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.record.declarations import DeclaredType
-from pycrorm_async.record.episode_writer import Emitter, EpisodeOpening, EpisodeWriter
+from pycrorm_async.record.episode_writer import Emitter, EpisodeWriter
+from pycrorm_async.record.opening import EpisodeOpening
 from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.settings import Settings
 from tests.databases import ask

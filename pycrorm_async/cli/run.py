@@ -32,7 +32,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import stderr
 from pycrorm_async.projections.custom import load_projections
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
-from pycrorm_async.record.episode_writer import PlanSource
+from pycrorm_async.record.opening import PlanSource
 from pycrorm_async.record.values import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
 

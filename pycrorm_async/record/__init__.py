@@ -1,7 +1,7 @@
 """Any executive writes episodes through this package, also our own plan layer.
 
-`Recording` is the way in. It declares types (`declarations`) and opens episodes. An `EpisodeWriter` writes what an
-episode consists of: its beginning and end, the starts and ends of its nodes, percepts, tags and observations.
+`Recording` is the way in. It declares types (`declarations`) and opens episodes (`opening`). An `EpisodeWriter` writes
+what an episode consists of: its beginning and end, the starts and ends of its nodes, percepts, tags and observations.
 `ObjectRows` keeps the rows of its objects, and `values` reads live values.
 
 `RecordedEpisode` takes keys and values of any executive, from any thread: it copies and converts them first, keeps the

@@ -62,17 +62,15 @@ from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.plan.task import TaskTreeNode, current_node
 from pycrorm_async.record.episode_writer import (
-    EPISODE_TEXT_MAX,
     UNAWAITED_MAX,
     Emitter,
-    EpisodeOpening,
     EpisodeWriter,
-    current_task,
     episode_text_of,
     name_of,
     put_observation,
 )
 from pycrorm_async.record.objects import ObjectRows
+from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, current_task
 from pycrorm_async.record.plan_types import Declarations
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import clean, encode_or_missing, failure_value, pose_value, read_parameters

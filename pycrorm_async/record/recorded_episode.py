@@ -31,18 +31,10 @@ from pycrorm_async.events.types import (
     SeenValue,
 )
 from pycrorm_async.record.declarations import DeclaredType
-from pycrorm_async.record.episode_writer import (
-    Emitter,
-    EpisodeOpening,
-    EpisodeWriter,
-    Failures,
-    OpenEpisodes,
-    end_statuses,
-    is_of_memory,
-    put_observation,
-)
+from pycrorm_async.record.episode_writer import Emitter, EpisodeWriter, OpenEpisodes, is_of_memory, put_observation
 from pycrorm_async.record.geometry import mass_of, urdf_of
 from pycrorm_async.record.objects import RecordedObject, RecordedObjects
+from pycrorm_async.record.opening import EpisodeOpening, Failures, end_statuses
 from pycrorm_async.record.values import (
     MissingValues,
     PoseLike,

@@ -20,13 +20,12 @@ from pycrorm_async.record.declarations import (
     declare_named,
     without_type,
 )
-from pycrorm_async.record.episode_writer import (
+from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
+from pycrorm_async.record.opening import (
     NO_LABELS,
-    Emitter,
     EpisodeOpening,
     Failures,
     Labels,
-    OpenEpisodes,
     Provenance,
     check_arguments,
     read_labels,
@@ -208,7 +207,7 @@ class Recording:
             text,
             plan=plan,
             seed=seed,
-            labels=read_labels(tags, metadata, self.emitter),
+            labels=read_labels(tags, metadata, self.emitter.settings, self.emitter.missing),
             world=world,
             simulated=simulated,
             thought_by=thought_by,

@@ -21,7 +21,7 @@ import pytest
 from pycrorm_async.cli import run as reader
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.run import plan_source
-from pycrorm_async.record.episode_writer import PlanSource
+from pycrorm_async.record.opening import PlanSource
 from tests.bullet import INSTALLED_BULLETS
 from tests.commands import answer, one_line_of, pycrorm, run_script
 

@@ -30,7 +30,7 @@ from pycrorm_async.plan import ParkArmsActionPerformable, PickUpActionPerformabl
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.queue.spool import Spool
-from pycrorm_async.record.episode_writer import PlanSource
+from pycrorm_async.record.opening import PlanSource
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.log import tags_of as log_tags

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import random
-import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from pycrorm_async import Memory, Settings, recover
+from pycrorm_async import Memory, Settings
 from pycrorm_async.memory import SyncMemory
 from pycrorm_async.plan.failures import NavigationGoalNotReached
 from pycrorm_async.record import executives as module
@@ -29,7 +25,6 @@ from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import json_text, plain_value
 from pycrorm_async.testing.contracts import check_executive
 from pycrorm_async.world.pose import Pose
-from tests.commands import environment
 from tests.databases import ask
 from tests.record.recordings import assert_verified, events, nodes, url_of
 
@@ -288,28 +283,6 @@ def test_the_number_of_repeats_is_written_rarely_while_they_go_on(tmp_path: Path
     assert written[:3] == [49, 99, 149]
     assert written[-1] == 1_000
     assert len(written) == 16
-
-
-_KILLED = """
-import os, signal, sys
-from pycrorm_async import Memory
-from pycrorm_async.record.executives import Activations
-from tests.record.test_executives import READER, Machine, State
-near = State("near")
-with Memory.sync(sys.argv[1], writer="daemon") as memory:
-    with Activations(memory.recording, "machine 1.0", READER, instant_s=60) as activations:
-        for _ in range(120):
-            Machine(activations).tick((near, "ok"))
-        os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_machine_loses_few_repeats(tmp_path: Path) -> None:
-    arguments = [sys.executable, "-c", _KILLED, url_of(tmp_path)]
-    assert subprocess.run(arguments, check=False, env=environment(), timeout=60).returncode == -signal.SIGKILL
-    asyncio.run(recover(url_of(tmp_path)))
-    assert ticked_nodes(tmp_path) == [("near", None, "SUCCEEDED", 100)]
 
 
 def test_states_that_never_come_again_do_not_fill_the_memory_of_the_process(

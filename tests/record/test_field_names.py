@@ -161,7 +161,7 @@ async def assert_clean(url: str) -> None:
     assert result.outdated is None
 
 
-@pytest.mark.soak_on(int, float)
+@pytest.mark.soak_on(int, float, bool)
 @pytest.mark.parametrize("kind", _VALUES, ids=lambda kind: kind.__name__)
 async def test_a_field_with_a_name_of_ours_has_its_value_in_node_view_class_frame_and_file(
     database_url: str, kind: type, tmp_path: Path
