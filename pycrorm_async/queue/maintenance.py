@@ -21,6 +21,7 @@ from pycrorm_async.queue.format import (
     EVENT,
     Frame,
     LastRecord,
+    ReadCursor,
     SegmentHeader,
     decode_header,
     encode_segment_header,
@@ -278,11 +279,11 @@ class _Count:
     segments: Counter[int] = field(default_factory=Counter)
     safe: int = 0
 
-    def count_frame(self, number: int, frame: Frame) -> None:
+    def count_frame(self, after: ReadCursor, frame: Frame) -> None:
         if frame.kind == COMMIT:
             self.safe = frame.position
             return
-        self.segments[number] += 1
+        self.segments[after.number] += 1
         self.types[frame.type.decode(errors="replace")] += 1
         if frame.kind == EVENT:
             self.episodes.add(frame.episode)

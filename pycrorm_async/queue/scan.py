@@ -107,8 +107,8 @@ def scan(folder: Path, recorder: bytes) -> ValidPrefix:
     return prefix
 
 
-def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[int, Frame], None] | None = None) -> Survey:
-    """Scan as `scan` does, and return damage. Calls `on_frame` with the segment number and each kept frame."""
+def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[ReadCursor, Frame], None] | None = None) -> Survey:
+    """Scan as `scan` does, and return damage. Calls `on_frame` with each kept frame and the cursor behind it."""
     scanner = SegmentScanner(folder, recorder, on_frame=on_frame)
     damage: SpoolDamaged | None = None
     try:
@@ -122,7 +122,7 @@ def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[int, Frame], No
 class SegmentScanner:
     """Scan from the oldest segment to the first hole, one segment per step.
 
-    Calls `on_frame` with the segment number and each kept frame, and `on_record` with each kept record. With
+    Calls `on_frame` with each kept frame and the cursor behind it, and `on_record` with each kept record. With
     `segments`, paths by number in any folders, the scan ends at the first hole without searching for commit frames.
     """
 
@@ -131,7 +131,7 @@ class SegmentScanner:
         folder: Path,
         recorder: bytes,
         *,
-        on_frame: Callable[[int, Frame], None] | None = None,
+        on_frame: Callable[[ReadCursor, Frame], None] | None = None,
         on_record: Callable[[Record], None] | None = None,
         segments: Mapping[int, Path] | None = None,
     ) -> None:
@@ -252,7 +252,7 @@ class SegmentScanner:
                     break
                 offset += size
                 if on_frame is not None:
-                    on_frame(number, make(Frame, frame))
+                    on_frame(ReadCursor(number, offset, position), make(Frame, frame))
         finally:
             self._cut = ReadCursor(number, offset, position)
 
@@ -400,39 +400,23 @@ def tails(folder: Path, prefix: ValidPrefix) -> list[tuple[Path, bytes]]:
 # missing: it and all later records belong to the torn tail.
 
 
-class _Referring(NamedTuple):
-    """A record with the blobs it refers to; `offset` is the sum of the frames before it in its segment."""
-
-    segment: int
-    offset: int
-    position: int
-    names: tuple[str, ...]
-
-
 def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
     """Truncate the segments of a locked folder; copies the tail aside first. Raises `OSError` and `SpoolForeign`.
 
     Leaves a damaged folder as it is, because a repair decides about its records.
     """
-    unsynced: list[_Referring] = []
-    sizes: dict[int, int] = {}
+    unsynced: list[tuple[ReadCursor, list[str]]] = []  # before a record, and the blobs that it refers to
 
-    def note(segment: int, frame: Frame) -> None:
+    def note(after: ReadCursor, frame: Frame) -> None:
         if frame.kind == COMMIT:
-            unsynced[:] = [each for each in unsynced if each.position > frame.position]
+            unsynced[:] = [each for each in unsynced if each[0].position >= frame.position]
         elif references := references_in(frame.type.decode(), frame.payload):
-            names = tuple(each.hash for each in references)
-            unsynced.append(_Referring(segment, sizes.get(segment, 0), frame.position, names))
-        sizes[segment] = sizes.get(segment, 0) + frame.size
+            before = ReadCursor(after.number, after.offset - frame.size, after.position - 1)
+            unsynced.append((before, [each.hash for each in references]))
 
     prefix, damage, _ = survey(folder, recorder, on_frame=note)
-    if damage is not None:
-        return
-    for each in unsynced:
-        if not all(is_whole(folder, name) for name in each.names):
-            path = segment_path(folder, each.segment)
-            header = read_header(path, read_segment(path), recorder=recorder, number=each.segment)
-            assert header is not None, "the segment was scanned"
-            offset = header_bytes(len(header.open)) + each.offset
-            seal(folder, prefix._replace(cut=ReadCursor(each.segment, offset, each.position - 1)))
-            return
+    if damage is None:
+        for before, names in unsynced:
+            if not all(is_whole(folder, name) for name in names):
+                seal(folder, prefix._replace(cut=before))
+                return

@@ -148,7 +148,7 @@ class _EpisodeFolder:
     def _resume(self) -> None:
         """Find the last record; truncate a torn tail and sync the rest."""
 
-        def note_last(_: int, frame: Frame) -> None:
+        def note_last(_: ReadCursor, frame: Frame) -> None:
             if frame.kind == EVENT:
                 self._last = _last_of(frame)
 

@@ -242,7 +242,7 @@ def declared_in_segments(writer: FolderWriter) -> list[list[bytes]]:
     survey_result = survey(
         writer.folder,
         RECORDER,
-        on_frame=lambda number, frame: segments.setdefault(number, []).append(
+        on_frame=lambda after, frame: segments.setdefault(after.number, []).append(
             frame.payload if frame.kind == DECLARATION else b""
         ),
     )
