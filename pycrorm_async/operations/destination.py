@@ -44,12 +44,7 @@ from pycrorm_async.projections.custom import Projection, installed_projections
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.blobs import read_blob
-from pycrorm_async.queue.format import (
-    map_segment,
-    salt_of,
-    segment_numbers,
-    segment_path,
-)
+from pycrorm_async.queue.format import map_segment, salt_of, segment_numbers, segment_path
 from pycrorm_async.queue.locks import STORED
 from pycrorm_async.queue.scan import SegmentScanner, last_event
 from pycrorm_async.queue.sources import computed_ends
@@ -83,21 +78,11 @@ class LogAndTables:
     events in its segments are appended again to a log that lost them.
     """
 
-    def __init__(
-        self,
-        log: EventLog,
-        projector: Projector,
-        spool: Path | None = None,
-        *,
-        batch_events_max: int = Settings.batch_events_max,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
+    def __init__(self, log: EventLog, projector: Projector, spool: Path | None = None) -> None:
         self.log = log
         self.log_id = log.log_id
         self._projector = projector
         self._spool = spool
-        self._batch_events_max = batch_events_max
-        self._clock = clock
         self._refused = False
         # SQLite allows one writer, and a waiting connection polls for the lock. A semaphore serves waiters in order.
         self._appending = asyncio.Semaphore(1 if log.address.is_sqlite else _APPENDS_AT_ONCE)
@@ -185,8 +170,8 @@ class LogAndTables:
                         )
                     ]
                     declared.update(each.payload for each in lost if each.episode is None)
-                    for start in range(0, len(lost), self._batch_events_max):
-                        batch = lost[start : start + self._batch_events_max]
+                    for start in range(0, len(lost), Settings.batch_events_max):
+                        batch = lost[start : start + Settings.batch_events_max]
                         for each, row in (await self.log.store(batch, numbers=numbers)).rows.items():
                             is_lost = recorder.over or each in confirmed
                             appended += is_lost * (row.head - heads.get(each, 0))
@@ -201,7 +186,7 @@ class LogAndTables:
         done = f"{appended:,} events were appended again; {incomplete} of {len(changed)} episodes stay incomplete"
         _log.warning("%s: %s; %s", self.log.address, cause, done)
         self._refused = True  # the layout of the tables may have gone back too
-        noticed = self._clock.wall_ns(), f"{socket.gethostname()}:{spool}", f"{cause}; {done}"
+        noticed = SYSTEM_CLOCK.wall_ns(), f"{socket.gethostname()}:{spool}", f"{cause}; {done}"
         for work in (partial(self.log.note_incarnation, *noticed), self.fold):
             try:
                 await work()
@@ -274,7 +259,7 @@ async def open_destination(
         projector = Projector(log, views=views, projections=projections, installed=installed)
         keeps = settings.keep_stored_s and settings.keep_stored_bytes
         kept = spool.path if keeps and stored_in(spool.path, log.log_id) else None
-        destination = LogAndTables(log, projector, kept, batch_events_max=settings.batch_events_max, clock=clock)
+        destination = LogAndTables(log, projector, kept)
         await destination.open_tables()
         yield destination
     finally:
