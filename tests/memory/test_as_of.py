@@ -129,12 +129,8 @@ def observed() -> Iterator[StateObserver]:
         recorder.reset(token)
 
 
-@pytest.mark.parametrize("sampled", [False, True], ids=["plain", "sampled"])
-async def test_snapshots_equal_the_observed_tree_and_world_after_every_event_of_a_plan(
-    tmp_path: Path, *, sampled: bool
-) -> None:
-    settings = Settings(sample_interval_ms=1) if sampled else Settings()
-    async with Memory.open(url_of(tmp_path), settings=settings) as memory:
+async def test_snapshots_equal_the_observed_tree_and_world_after_every_event_of_a_plan(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path), settings=Settings(sample_interval_ms=1)) as memory:
         async with memory.episode(description="a test") as episode:
             with observed() as keeper, lab(keeper) as scene:
                 spoon = Object("spoon", ObjectType.SPOON, pose=Pose([1.3, 1, 1.05]))

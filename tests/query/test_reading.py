@@ -37,7 +37,6 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
-from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
@@ -230,16 +229,6 @@ async def test_a_frame_accepts_conditions_with_enum_members_and_joins(reading: R
     assert frame.to_dict("records") == [{"arm": "LEFT", "name": "milk", "x": 1.0, "status": "FAILED"}]
 
 
-async def test_a_frame_has_times_in_utc(reading: Reading) -> None:
-    question = select(TaskTreeNode.start_time, TaskTreeNode.end_time).where(
-        TaskTreeNode.process_metadata_id == 1, TaskTreeNode.kind == "action"
-    )
-    frame = await reading.dataframe(question.order_by(TaskTreeNode.id))
-    assert [str(each) for each in frame.dtypes] == ["datetime64[us, UTC]"] * 2
-    assert list(frame.start_time) == [pd.Timestamp(moment(each)) for each in (4, 5, 6)]
-    assert frame.end_time.isna().tolist() == [False, True, False]
-
-
 async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Reading) -> None:
     frame = await reading.dataframe(select(NavigateAction))
     assert list(frame.columns) == [
@@ -305,22 +294,6 @@ async def test_a_frame_counts_groups_and_accepts_aliases(reading: Reading) -> No
     there = aliased(Pose, name="there")
     frame = await reading.dataframe(select(there.x.label("far")).where(there.x > 6).order_by(there.id))
     assert frame.to_dict("list") == {"far": [7.0, 7.0]}
-
-
-async def test_an_empty_answer_is_a_frame_with_columns(reading: Reading) -> None:
-    frame = await reading.dataframe(select(Pose.x, Pose.time).where(Pose.id < 0))
-    assert list(frame.columns) == ["x", "time"]
-    assert len(frame) == 0
-    assert str(frame.dtypes["time"]) == "datetime64[us, UTC]"
-
-
-@pytest.mark.slow
-async def test_a_fresh_memory_has_no_episodes(log: EventLog) -> None:
-    await Projector(log).open()
-    async with Reading.open_address(log.address) as opened:
-        assert await opened.episodes() == []
-        with pytest.raises(UnknownEpisode):
-            await opened.episode("last")
 
 
 # === frames ===================================================================================================

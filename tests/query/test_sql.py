@@ -459,13 +459,6 @@ async def test_a_query_with_a_parameter_is_refused_with_the_way_to_write_it(sql:
             await sql.query(text)
 
 
-async def test_an_open_memory_for_reading_takes_queries(reader_url: str) -> None:
-    async with Reading.open(reader_url) as reading:
-        assert (await reading.query("SELECT count(*) AS episodes FROM process_metadata")).rows == [(2,)]
-        with pytest.raises(QueryRefused):
-            await reading.query("DELETE FROM event", SqlLimits(rows=1))
-
-
 async def test_a_wrong_name_is_answered_with_the_nearest_one(sql: SqlReader) -> None:
     with pytest.raises(QueryRefused, match=r"no table or view root_failures; did you mean root_failure\?"):
         await sql.query("SELECT * FROM root_failures")
