@@ -64,7 +64,6 @@ def number_of_rows(url: str) -> int:
     return sum(counts)
 
 
-@pytest.mark.soak_on("postgresql")
 def test_an_intact_memory_is_reported_as_such(folder: Path) -> None:
     rows = number_of_rows(f"sqlite:///{folder}/pycrorm.db")
     done = pycrorm("verify", cwd=folder)
@@ -77,7 +76,6 @@ def test_an_intact_memory_is_reported_as_such(folder: Path) -> None:
     }  # fmt: skip
 
 
-@pytest.mark.soak_on("postgresql")
 def test_differences_are_printed_with_both_values_and_exit_with_1_and_damage_with_4(folder: Path) -> None:
     file = folder / "pycrorm.db"
     ask_to_change(file, "UPDATE zz_detection__1001 SET name = '[b]mïlk' WHERE id >> 31 = 2 AND position = 0")
@@ -111,7 +109,6 @@ def test_differences_are_printed_with_both_values_and_exit_with_1_and_damage_wit
     assert (document["damage"], document["drift"]) == (1, 3)
 
 
-@pytest.mark.soak_on("postgresql")
 def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) -> None:
     ask_to_change(folder / "pycrorm.db", "UPDATE zz_task_tree_node__1001 SET simulated = 1 - simulated, start_ns = 0")
     ask_to_change(folder / "pycrorm.db", "UPDATE zz_pose__1001 SET x = -x - 1, time = 0, frame = NULL")
@@ -125,7 +122,6 @@ def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) 
     assert (document["drift"], len(document["differences"])) == (count, min(count, 100))
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_view_that_is_left_out_exits_with_1(folder: Path) -> None:
     url = f"sqlite:///{folder}/pycrorm.db"
     log = await opened(url)
@@ -149,7 +145,6 @@ async def fold_records(log: EventLog, records: Sequence[Record]) -> None:
     await projector.catch_up()
 
 
-@pytest.mark.soak_on("postgresql")
 def test_an_impossible_verification_is_one_line(folder: Path) -> None:
     done = pycrorm("verify", "--episode", "7", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
@@ -160,7 +155,6 @@ def test_an_impossible_verification_is_one_line(folder: Path) -> None:
     assert "a table is missing: run `pycrorm rebuild`" in one_line_of(done)
 
 
-@pytest.mark.soak_on("postgresql")
 def test_a_log_without_tables_and_a_database_without_a_memory_are_one_line_each(tmp_path: Path) -> None:
     async def record_plan() -> None:
         log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/bare.db"), create=True)
@@ -182,7 +176,6 @@ def test_a_log_without_tables_and_a_database_without_a_memory_are_one_line_each(
         assert reason in one_line_of(done)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_rows_missing_from_the_tables_are_printed_one_a_line_and_exit_with_1(folder: Path) -> None:
     file = folder / "pycrorm.db"
     ask_to_change(file, "UPDATE episode SET parked = 'event 7: by hand' WHERE number = 2")
@@ -217,7 +210,6 @@ async def test_rows_missing_from_the_tables_are_printed_one_a_line_and_exit_with
     assert answer("verify", cwd=folder, code=1)["outdated"].endswith("run `pycrorm rebuild`")
 
 
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak
 async def test_on_postgresql_every_role_that_may_read_may_verify(server: Server, tmp_path: Path) -> None:
     url = server.new_database()

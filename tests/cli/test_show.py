@@ -322,7 +322,6 @@ async def test_every_event_is_a_line_with_all_its_fields(database_url: str, tmp_
     assert lines_of(some) == [each for each in expected if each["type"] in ("NodeEnded", "ObjectAdded")]
 
 
-@pytest.mark.soak_on("postgresql")
 def test_no_character_is_lost_on_a_terminal_with_ascii_alone(tmp_path: Path) -> None:
     script = Script(1)
     script.put_payload("NodeStarted", '{"kind":"root","text":"Grüße, 牛奶"}'.encode())
@@ -337,7 +336,6 @@ def test_no_character_is_lost_on_a_terminal_with_ascii_alone(tmp_path: Path) -> 
     assert json.loads(done.stdout)["payload"]["text"] == "Grüße, 牛奶"
 
 
-@pytest.mark.soak_on("postgresql")
 def test_a_reader_that_closes_the_pipe_ends_the_command_without_a_message(tmp_path: Path) -> None:
     asyncio.run(append_and_fold(f"sqlite:///{tmp_path}/pycrorm.db", run_of(episode(1), 1, 5_000), folded=False))
     process = subprocess.Popen(
@@ -352,7 +350,6 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_without_a_message(tmp_pa
     process.stderr.close()
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
     await append_and_fold(url, hand_written(1).records, folded=False)
@@ -369,7 +366,6 @@ async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_pat
     assert one_line_of(done).startswith(f"pycrorm: episode {IDENTITY}, event 4: its payload cannot be read: ")
 
 
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     ("arguments", "code", "reason"),
     [

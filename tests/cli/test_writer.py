@@ -208,7 +208,6 @@ def test_an_episode_without_a_number_is_a_problem_each_time_and_is_kept(database
     assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
 
 
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("alive", [True, False])
 def test_an_earlier_refusal_is_a_problem_even_while_its_recorder_is_alive(tmp_path: Path, *, alive: bool) -> None:
     spool = tmp_path / "pycrorm.db.spool"
