@@ -13,13 +13,10 @@ from typing import Final
 import pytest
 
 LONGEST: Final = """
-    integrations/pycram/test_unusual_plans integrations/pycram/test_plans crash/test_crash_points
-    crash/test_daemon learning/test_experiment crash/test_cancelled cli/test_learn
-    learning/test_policy promises/test_defects_of_storage crash/test_many_machines
-    operations/test_workers crash/test_rebuild_kill projections/test_rebuild promises/test_public_types
-    plan/test_locations plan/test_doors memory/test_lost_storage
-    store/test_postgresql_faults crash/test_killed bench/test_figures operations/test_copy
-    promises/test_pages
+    integrations/pycram/test_unusual_plans integrations/pycram/test_plans promises/test_pages crash/test_crash_points
+    crash/test_daemon crash/test_cancelled promises/test_defects_of_storage crash/test_many_machines
+    promises/test_without_bullet crash/test_rebuild_kill crash/test_killed promises/test_one_bad_episode
+    promises/test_every_format promises/test_clock_steps
 """.split()
 """The modules with a test of 5 s or more, the longest first. Most tests of a run take less than 0.1 s."""
 
