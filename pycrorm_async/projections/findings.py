@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, Literal, NamedTuple, Protocol
@@ -110,41 +111,42 @@ class Comparison:
     ) -> list[Difference]:
         """Return the differences between the tables and the folded rows of these episodes, in the caller's snapshot."""
         self.count = 0
-        expected = self._expected(rows)
+        folded = defaultdict[str, list[tuple[tuple[str, ...], Sequence[Row]]]](list)
+        for (name, columns), some in rows.to_insert().items():
+            folded[name].append((columns, some))
         differences: list[Difference] = []
         first, end = episodes
         row_range = row_id_min(first), None if end is None else row_id_min(end)
         for name, table in self._tables.items():
-            folded = expected.pop(name, {})
             low, high = (first, end) if name in _EPISODE_KEYED else row_range
             key = next(iter(table.primary_key.columns))
             # The first range also has the rows of numbers below 0, which no episode has.
             where = [*([key >= low] if first else []), *([key < high] if high is not None else [])]
             stored = await _rows(connection, table, *where)
             self.count += len(stored)
-            differences += _compared(name, [*table.columns.keys()], folded, stored)
-        for name, folded in expected.items():  # of types declared after these tables were created
-            differences += _compared(name, [], folded, {})
+            differences += _compared(name, [*table.columns.keys()], _by_key(table, folded.pop(name, ())), stored)
+        for name, parts in folded.items():  # of types declared after these tables were created
+            differences += _compared(name, [], _by_key(None, parts), {})
         return differences
 
-    def _expected(self, rows: FoldedRows) -> dict[str, dict[Row, Row]]:
-        expected: dict[str, dict[Row, Row]] = {}
-        for (name, columns), folded in rows.to_insert().items():
-            table = self._tables.get(name)
-            whole = columns if table is None else tuple(table.columns.keys())
-            into = expected.setdefault(name, {})
-            keys = _key_of(columns, table)
-            if whole == columns:
-                into.update((keys(row), row) for row in folded)
-                continue
-            if set(whole) <= set(columns):
-                in_order = itemgetter(*map(columns.index, whole))
-                into.update((keys(row), in_order(row)) for row in folded)
-                continue
-            places = [columns.index(each) if each in columns else None for each in whole]
-            for row in folded:
-                into[keys(row)] = tuple(None if place is None else row[place] for place in places)
-        return expected
+
+def _by_key(table: Table | None, parts: Iterable[tuple[tuple[str, ...], Sequence[Row]]]) -> dict[Row, Row]:
+    """Return folded rows, given with their columns, by key and in the columns of the table."""
+    by_key: dict[Row, Row] = {}
+    for columns, folded in parts:
+        whole = columns if table is None else tuple(table.columns.keys())
+        keys = _key_of(columns, table)
+        if whole == columns:
+            by_key.update((keys(row), row) for row in folded)
+            continue
+        if set(whole) <= set(columns):
+            in_order = itemgetter(*map(columns.index, whole))
+            by_key.update((keys(row), in_order(row)) for row in folded)
+            continue
+        places = [columns.index(each) if each in columns else None for each in whole]
+        for row in folded:
+            by_key[keys(row)] = tuple(None if place is None else row[place] for place in places)
+    return by_key
 
 
 async def _rows(connection: AsyncConnection, table: Table, *where: ColumnElement[bool]) -> dict[Row, Row]:
