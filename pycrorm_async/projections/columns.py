@@ -401,12 +401,8 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 # `recall_block`, the index of the recall of all episodes, has cases of many of them, and 0 as its episode. The
 # checkpoints of a projection (`pycrorm_progress`) are keyed by the number of an episode, as `episode` is.
 
-_TEXT_KEYS = {
-    ("parameter_item", "field"),
-    ("joint_change", "joint"),
-    ("state_sample", "channel"),
-    (LINK_BOX, "model"),
-}
+_TEXT_KEYS = ("field", "joint", "channel", "model")
+"""The columns of keys that are texts; all others are integers."""
 
 _FURTHER = {("task_tree_node", "dtype"): ("status",), ("episode_tagging", "tag"): (EPISODE,)}
 """Further key columns of an index, after its first: learning queries filter the nodes of a type by status, and
@@ -447,7 +443,7 @@ def _make_table(
         *(
             Column(
                 stored(column),
-                Text() if (name, column) in _TEXT_KEYS else column_type(storage),
+                Text() if storage == "key" and column in _TEXT_KEYS else column_type(storage),
                 nullable=storage != "key",
                 autoincrement=False,
                 key=column,
