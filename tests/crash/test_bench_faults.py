@@ -5,29 +5,23 @@ The bench detects such errors: with a deliberately broken product its counts ris
 
 from __future__ import annotations
 
-import asyncio
 import json
 import random
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from bench.breaking import databases, files, restores
+from bench.breaking import databases, files
 from bench.breaking.outcome import Outcome, Step
 from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.operations.destination import LogAndTables
-from pycrorm_async.projections.findings import VerifyResult
-from pycrorm_async.projections.verify import verify
 from pycrorm_async.queue import DeadSource, RecorderQueue
 from pycrorm_async.store.log import EventLog
-from tests.backups import Backup
 
 pytestmark = pytest.mark.slow
 
@@ -217,46 +211,3 @@ def test_the_bench_detects_a_log_that_reports_events_as_stored_without_storing_t
     monkeypatch.setattr(EventLog, "append", forgetful)
     outcome = databases.locked_files(2, random.Random(1), tmp_path, lambda: None)
     assert (outcome.events, outcome.lost) == (800, 1)
-
-
-IN_AN_EPISODE = 0
-"""The seed of a round in which the database is restored in the middle of an episode."""
-
-
-@pytest.fixture
-def only_flushes_fold(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(restores, "_SETTINGS", replace(restores._SETTINGS, idle_ms=60_000))
-
-
-@pytest.mark.soak
-@pytest.mark.usefixtures("only_flushes_fold")
-def test_the_bench_verifies_a_round_only_after_every_event_of_it_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def verify_later(log: EventLog) -> VerifyResult:
-        await asyncio.sleep(0.3)  # six times the delay of an append
-        return await verify(log)
-
-    monkeypatch.setattr(restores, "verify", verify_later)
-    outcome = restores.restored_servers(1, random.Random(IN_AN_EPISODE), tmp_path, lambda: None)
-    assert (outcome.rounds, outcome.corrupted, outcome.rounds_failed) == (1, 0, [])
-
-
-@pytest.mark.soak
-@pytest.mark.usefixtures("only_flushes_fold")
-def test_the_bench_detects_a_flush_that_folds_nothing_after_a_restore(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    restore = Backup.restore
-
-    async def fold_nothing(_: LogAndTables) -> int:
-        return 0
-
-    def restore_and_break(backup: Backup) -> None:
-        restore(backup)
-        monkeypatch.setattr(LogAndTables, "fold", fold_nothing)
-
-    monkeypatch.setattr(Backup, "restore", restore_and_break)
-    outcome = restores.restored_servers(1, random.Random(IN_AN_EPISODE), tmp_path, lambda: None)
-    assert outcome.corrupted > 0
-    assert outcome.rounds_failed == [1]

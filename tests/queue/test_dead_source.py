@@ -287,15 +287,6 @@ async def test_foreign_files_in_a_folder_are_never_deleted(author: FolderWriter)
     assert Spool(author.folder.parent).recorders() == []
 
 
-def test_a_folder_that_cannot_be_read_is_reported_in_one_clear_line(author: FolderWriter) -> None:
-    author.put(started())
-    author.segments[0].unlink()
-    author.segments[0].mkdir()
-    with pytest.raises(SpoolUnavailable) as refused:
-        open_dead(author.folder)
-    assert "00000001.segment: Is a directory" in str(refused.value)
-
-
 async def test_a_disk_that_does_not_sync_a_dead_recorders_records_is_reported_before_any_is_supplied(
     author: FolderWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -499,7 +490,7 @@ async def supplied_before_damage(folder: Path, *, events_max: int = 10_000) -> l
     return records
 
 
-@pytest.mark.parametrize("events_max", [1, 2, 5, 100])
+@pytest.mark.parametrize("events_max", [1, 100])
 async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(spool: Path, events_max: int) -> None:
     author = long_folder(spool)
     recovered = open_dead(author.folder)
