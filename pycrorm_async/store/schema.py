@@ -147,9 +147,24 @@ def _batch(name: str, **columns: TypeEngine[Any] | type[TypeEngine[Any]]) -> sql
     ).subquery(name)
 
 
-def _is_among(column: sql.Column[Any], name: str) -> sql.ColumnElement[bool]:
+class _IsAmong(FunctionElement[bool]):
+    """Whether a column has a value that a query selects, to be found by an index of the column.
+
+    PostgreSQL expects ten values of an array, and a hundred of a JSON array: it would read a table of thousands whole.
+    """
+
+    inherit_cache = True
+
+
+@compiles(_IsAmong)
+def _compile_is_among(element: _IsAmong, compiler: Any, **options: Any) -> str:
+    column, values = (compiler.process(each, **options) for each in element.clauses)
+    return f"{column} IN {values}" if _is_sqlite(compiler) else f"{column} = ANY (ARRAY{values})"
+
+
+def _is_among(column: sql.Column[Any], name: str) -> _IsAmong:
     """Whether the column is a value of a parameter, a JSON array of arrays of one value."""
-    return column.in_(select(_batch(name, value=column.type)))
+    return _IsAmong(column, select(_batch(name, value=column.type)).scalar_subquery())
 
 
 def _insert_batch(table: sql.Table, batch: sql.Subquery) -> Any:
@@ -259,6 +274,7 @@ _steps = _batch("steps", number=_Long, before=_Long, folded=_Long)
 _taken = (
     select(_steps)
     .join(EPISODE, EPISODE.c.number == _steps.c.number)
+    .where(_IsAmong(EPISODE.c.number, select(_steps.c.number).correlate(None).scalar_subquery()))
     .order_by(EPISODE.c.number)
     .with_for_update(of=EPISODE)
     .cte("taken")

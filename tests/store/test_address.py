@@ -124,14 +124,3 @@ async def test_a_commit_waits_for_the_disk_and_a_reader_cannot_write(address: Da
             await connection.execute(text("INSERT INTO t VALUES (1)"))
     await writing.dispose()
     await reading.dispose()
-
-
-async def test_a_write_transaction_rolls_back_tables_as_well(address: DatabaseAddress) -> None:
-    address.path.touch()
-    engine = address.engine()
-    async with engine.begin() as connection:
-        await connection.execute(text("CREATE TABLE t (a)"))
-        await connection.rollback()
-    async with engine.connect() as connection:
-        assert (await connection.execute(text("SELECT count(*) FROM sqlite_master"))).scalar_one() == 0
-    await engine.dispose()

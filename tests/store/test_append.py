@@ -17,6 +17,7 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_t
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow
 from tests.databases import ask, ask_to_change
 from tests.store.factories import HEADS, declaration, episode, name, record, run_of
 
@@ -72,6 +73,7 @@ async def test_an_episode_row_has_the_times_of_its_start_and_end(log: EventLog, 
     assert ask(database_url, HEADS) == [(1, name(1), 2, 0, 100, None, None, None)]
     await log.append([record(episode(1), 3, wall_ns=300, kind="EpisodeEnded")])
     assert ask(database_url, HEADS) == [(1, name(1), 3, 0, 100, 300, None, None)]
+    assert await log.episodes() == [EpisodeRow(1, name(1), 3, 0, 100, 300, None, None)]
     await log.append([record(episode(1), 4, wall_ns=400, kind="NodeEnded")])
     assert ask(database_url, HEADS) == [(1, name(1), 4, 0, 100, 300, None, None)]
 

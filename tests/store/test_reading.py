@@ -12,12 +12,13 @@ from sqlalchemy import text
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import Record
 from pycrorm_async.store import schema, sqlite
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.append import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite_engine import Connection
-from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
-from tests.databases import ask, ask_to_change
+from pycrorm_async.store.stored import Incarnation, Span, StoredEvent
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.store.factories import episode, record, run_of
 
 
@@ -118,11 +119,6 @@ async def test_each_time_the_log_went_back_is_noted_with_its_reason(log: EventLo
     assert await log.incarnations() == noted
 
 
-async def test_an_episode_row_holds_all_its_columns(log: EventLog) -> None:
-    await log.append([record(episode(1), 1, wall_ns=10), record(episode(1), 2, wall_ns=20, kind="EpisodeEnded")])
-    assert await log.episodes() == [EpisodeRow(1, "00000000-0000-0000-0000-000000000001", 2, 0, 10, 20, None, None)]
-
-
 async def test_the_query_for_unfolded_episodes_reads_no_other_episode(file_log: EventLog) -> None:
     def plan_of(statement: object, *parameters: object) -> str:
         steps = ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statement}", parameters)
@@ -138,8 +134,19 @@ async def test_the_query_for_unfolded_episodes_reads_no_other_episode(file_log: 
     assert "episode_stopped" in plan_of(compiled(schema.SELECT_STOPPED))
     again = plan_of(compiled(schema.SELECT_EVENTS_BY_KEY), "[]")
     assert "SEARCH event USING INDEX" in again
-    assert "SEARCH episode USING INTEGER PRIMARY KEY" in plan_of(compiled(schema.ADVANCE_FOLDED), "[]")
+    assert "SEARCH episode USING INTEGER PRIMARY KEY" in plan_of(compiled(schema.ADVANCE_FOLDED), "[]", "[]")
     assert "SEARCH episode USING INDEX" in plan_of(compiled(schema.LOCK_EPISODES), "[]")
+
+
+async def test_an_append_and_a_fold_find_their_episodes_on_a_server_by_an_index(server: Server) -> None:
+    url = server.new_database()
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    await log.close()
+    episodes = "SELECT number, number::text, 5, 0 FROM generate_series(1, 10000) AS number"
+    change_each(url, (f"INSERT INTO episode (number, id, head, started_wall_ns) {episodes}", "ANALYZE episode"))
+    for statement in (schema.LOCK_EPISODES, schema.SELECT_HEADS, schema.SELECT_NUMBERS, schema.ADVANCE_FOLDED):
+        plan = ask(url, f"EXPLAIN {dialect_of(log.engine).compile(statement)}", ["[]"])
+        assert "Seq Scan" not in str(plan), plan
 
 
 async def test_events_are_read_even_if_together_they_exceed_the_limit_of_one_value(file_log: EventLog) -> None:
