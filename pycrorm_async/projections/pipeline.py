@@ -59,6 +59,7 @@ from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
+from pycrorm_async.store.schema import SELECT_BEHIND
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent, beyond, consecutive, pages_of, share_out, size_of
 
 LOOKAHEAD_EVENTS_MIN: Final = 2_000
@@ -218,7 +219,9 @@ class FoldRunner:
     async def size(self) -> int:
         """Return the number of events that the next batch would have."""
         with self._log.translated():
-            return size_of(share_out(await self._target.behind(0, self._batch_events), self._batch_events))
+            async with self._log.reading() as connection:
+                behind = await self._target.behind(connection, 0, self._batch_events)
+            return size_of(share_out(behind, self._batch_events))
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         """Read and fold these events, yielding to the event loop at intervals. Writes nothing."""
@@ -250,12 +253,13 @@ class FoldRunner:
 
     async def _spans(self, before: BatchPreview | None) -> list[Span]:
         # Start behind the last batch's episode, so that an episode that always grows does not starve the others.
-        for after in (self.last_number, 0) if self.last_number else (0,):
-            episodes = await self._target.behind(after, self._batch_events)
-            if episodes := beyond(episodes, before.reached if before is not None else {}):
-                spans = share_out(episodes, self._batch_events)
-                self.last_number = spans[-1].number
-                return spans
+        async with self._log.reading() as connection:
+            for after in (self.last_number, 0) if self.last_number else (0,):
+                episodes = await self._target.behind(connection, after, self._batch_events)
+                if episodes := beyond(episodes, before.reached if before is not None else {}):
+                    spans = share_out(episodes, self._batch_events)
+                    self.last_number = spans[-1].number
+                    return spans
         return []
 
     async def _folded(self, spans: Sequence[Span]) -> _PreparedBatch:
@@ -539,7 +543,7 @@ class FoldTarget(GrowthTarget, Protocol):
 
     log: EventLog
 
-    async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
+    async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
         """Return the episodes above number `after` whose events this generation lacks, without parked ones."""
         ...
 
@@ -562,8 +566,8 @@ class LiveTarget:
     def __init__(self, log: EventLog) -> None:
         self.log = log
 
-    async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
-        return await self.log.behind(after, limit)
+    async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
+        return await dialect_of(connection).rows(connection, EpisodeRow, SELECT_BEHIND, after=after, limit=limit)
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
         if steps and not await advance_folded(connection, steps):
@@ -619,20 +623,19 @@ class SideTarget:
         self._share = share
         self._place = ""
 
-    async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
-        async with self.log.reading() as connection:
-            await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
-            if self.newest_only:
-                newest = (await connection.execute(_NEWEST)).scalar_one()
-                after = max(after, newest - _NEWEST_EPISODES)
-            return await episodes_behind(
-                connection,
-                self._place,
-                after=after,
-                limit=min(limit, _BEHIND_EPISODES_MAX),
-                share=self._share,
-                after_tables=self._projection is not None,
-            )
+    async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
+        await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
+        if self.newest_only:
+            newest = (await connection.execute(_NEWEST)).scalar_one()
+            after = max(after, newest - _NEWEST_EPISODES)
+        return await episodes_behind(
+            connection,
+            self._place,
+            after=after,
+            limit=min(limit, _BEHIND_EPISODES_MAX),
+            share=self._share,
+            after_tables=self._projection is not None,
+        )
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
         if not await advance(connection, self._place, steps, parked):

@@ -197,7 +197,9 @@ async def test_a_batch_that_another_process_has_folded_meanwhile_is_not_written(
         for each in (log, other):
             target = SideTarget(each, f"{PROJECTION}grasp_rate", "grasp_rate", GraspRate.version)
             folds.append(FoldRunner(target, learner_of(GraspRate())))
-            await folds[-1].prepare(share_out(await target.behind(0, 100), 100))
+            async with each.reading() as connection:
+                behind = await target.behind(connection, 0, 100)
+            await folds[-1].prepare(share_out(behind, 100))
         assert [await each.write() for each in folds] == [len(script.records) - 4, 0]
     finally:
         await other.close()
