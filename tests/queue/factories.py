@@ -74,13 +74,12 @@ def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL, offer
 
 def fill(queue: RecorderQueue, *, reserved: bool = False) -> int:
     """Put nodes until the queue refuses one; return their number."""
-    count = 0
-    while True:
+    for count in range(10_000):
         try:
             queue.put_nowait(node(), PAYLOAD, reserved=reserved)
         except SpoolFull:
             return count
-        count += 1
+    raise AssertionError("the queue is never full")
 
 
 def crashed_copy(queue: RecorderQueue, spool: Path) -> Path:

@@ -2,6 +2,7 @@
 recoverable.
 """
 
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import LiveSource, Spool, open_dead
+from pycrorm_async.queue.format import COMMIT, EVENT, decode_each, header_bytes, salt_of
 from pycrorm_async.queue.maintenance import finish_repairs, inspect_spool, repair_folder
 from pycrorm_async.queue.sources import DeadLetters
 from tests.queue.factories import (
@@ -91,6 +93,25 @@ async def test_records_that_the_next_process_puts_again_are_kept_once(own: Path)
     ]
     shutil.rmtree(own)
     assert await recover(kept_in(own)) == placed([*some(5, 9), end(10)])
+
+
+def test_dead_letters_are_synced_before_their_commit_frame_and_that_before_the_put_returns(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused = DeadLetters(own)
+    refused.put(some(5, 5))
+    synced: list[list[int]] = []
+    fdatasync = os.fdatasync
+
+    def watched(descriptor: int) -> None:
+        content = Path(f"/proc/self/fd/{descriptor}").read_bytes()
+        synced.append([kind for kind, *_ in decode_each(content, header_bytes(1), salt_of(RECORDER, 1))])
+        fdatasync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", watched)
+    refused.put(some(6, 7))
+    assert synced == [[EVENT, COMMIT, EVENT, EVENT], [EVENT, COMMIT, EVENT, EVENT, COMMIT]]
+    refused.release()
 
 
 @pytest.mark.slow

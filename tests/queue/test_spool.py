@@ -315,10 +315,25 @@ def test_the_file_systems_of_robots_are_accepted(tmp_path: Path) -> None:
     assert file_system_type(tmp_path / "gone") == 0
 
 
-@pytest.mark.parametrize(("kind", "name"), [(0x6969, "NFS"), (0xFF534D42, "CIFS"), (0x2FC12FC1, "ZFS")])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (BTRFS, "btrfs"),
+        (0xCA451A4E, "bcachefs"),
+        (0x2FC12FC1, "ZFS"),
+        (0x3434, "NILFS"),
+        (0x6969, "NFS"),
+        (0x517B, "SMB"),
+        (0xFF534D42, "CIFS"),
+        (0xFE534D42, "SMB"),
+        (0x00C36400, "Ceph"),
+        (0x5346414F, "AFS"),
+    ],
+)
 def test_other_file_systems_are_refused_by_their_name(
     tmp_path: Path, kind: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(locks, "file_system_type", lambda _: kind)
     with pytest.raises(SpoolUnavailable, match=f"lies on {name}, where"):
-        check_file_system(tmp_path / "spool")
+        make(tmp_path / "spool")
+    assert not (tmp_path / "spool").exists()

@@ -427,13 +427,20 @@ async def test_a_result_that_is_too_large_is_recorded_as_missing() -> None:
 
 
 async def test_a_fault_of_the_memory_never_reaches_the_plan_and_is_counted() -> None:
+    @dataclass
+    class BreakActionPerformable(ActionAbstract):
+        async def perform(self) -> str:
+            case.sink.broken = True
+            return "done"
+
     with recorder_case() as case, case.episode(), BulletWorld():
-        case.sink.broken = True
+        assert await BreakActionPerformable().perform() == "done"
+        assert case.emitter.faults.last == "NodeEnded: RuntimeError: the disk is on fire"
         Object("milk", ObjectType.MILK)
         note = NoteActionPerformable("x")
         assert await note.perform() == "x"
         assert note.ran
-        assert case.emitter.faults.total == 2
+        assert case.emitter.faults.total == 3
         assert case.emitter.faults.last == "NodeStarted: RuntimeError: the disk is on fire"
         case.sink.broken = False
 
