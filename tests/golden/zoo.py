@@ -17,6 +17,7 @@ import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract, PlanFailure
@@ -38,7 +39,7 @@ class PourActionPerformable(ActionAbstract):
             raise PlanFailure(f"{self.into} is full")
 
 
-async def make(url: str) -> None:
+async def _make_and_die(url: str) -> NoReturn:
     async with Memory.open(url, settings=SETTINGS) as memory:
         async with memory.episode(description="poured"):
             await PourActionPerformable("glass", 0.25).perform()
@@ -47,9 +48,11 @@ async def make(url: str) -> None:
                 await PourActionPerformable("bowl", 1.5).perform()
         await memory.flush()
     memory = await Memory.open(url, settings=SETTINGS).__aenter__()
-    await memory.episode(description="cut short").__aenter__()
+    episode = memory.episode(description="cut short")  # a block that is dropped would end its episode
+    await episode.__aenter__()
     await PourActionPerformable("jug", 0.5).perform()
     await memory.synced()
+    os._exit(0)
 
 
 def main(archive: Path) -> None:
@@ -61,11 +64,6 @@ def main(archive: Path) -> None:
         with tarfile.open(archive, "w:gz") as packed:
             for path in sorted(Path(folder).iterdir()):
                 packed.add(path, path.name, filter=_without_owner)
-
-
-async def _make_and_die(url: str) -> None:
-    await make(url)
-    os._exit(0)
 
 
 if __name__ == "__main__":
