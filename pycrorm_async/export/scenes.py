@@ -398,7 +398,7 @@ def _scene(
             yield change.when, "/scene", kinds.SceneUpdate(entities=entities)
 
 
-def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
+def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[SceneShape]) -> Any:
     cubes, cylinders, spheres = [], [], []
     for each in shapes:
         pose = kinds.Pose(position=_vector(kinds, each.translation), orientation=_rotation(kinds, each.rotation))
@@ -508,9 +508,9 @@ def _indexes(rr: Any, whens: Sequence[EventTime]) -> list[Any]:
     ]
 
 
-def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[Shape]) -> None:
+def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[SceneShape]) -> None:
     """Log the shapes of a frame at the set time, and not as static, because static ones cannot be cleared."""
-    by_kind: dict[str, list[Shape]] = {}
+    by_kind: dict[str, list[SceneShape]] = {}
     for each in shapes:
         by_kind.setdefault(each.kind, []).append(each)
     for kind, members in by_kind.items():
@@ -585,7 +585,7 @@ class FrameChange(NamedTuple):
     rotation: tuple[float, float, float, float]
 
 
-class Shape(NamedTuple):
+class SceneShape(NamedTuple):
     """A shape in the frame of a link: kind (box, cylinder, capsule, sphere), sizes (m), pose and colour.
 
     The sizes of a box are its three edges, of a cylinder and a capsule radius and length, of a sphere the radius.
@@ -676,11 +676,11 @@ def frame_changes(episode: ExportedEpisode, objects: Mapping[int, SceneObject]) 
             yield from objects[change.object].changes(change)
 
 
-def _shape(shape: Sequence[Any], color: Sequence[float] | None) -> Shape:
+def _shape(shape: Sequence[Any], color: Sequence[float] | None) -> SceneShape:
     kind, sizes, xyz, rpy, own = shape
     translation, rotation = _parts(origin(xyz, rpy))
     red, green, blue, opacity = color or own or _GREY
-    return Shape(kind, tuple(sizes), translation, rotation, (red, green, blue, opacity))
+    return SceneShape(kind, tuple(sizes), translation, rotation, (red, green, blue, opacity))
 
 
 def _parts(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:

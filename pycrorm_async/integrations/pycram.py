@@ -27,7 +27,7 @@ from typing import Any, Final, Protocol
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import NodeStatus, SeenValue
 from pycrorm_async.integrations.foreign_package import ForeignPackage
-from pycrorm_async.integrations.pycram_values import Change, PyCRAMEpisodes, PyCRAMValues, RunningNode
+from pycrorm_async.integrations.pycram_values import MotionChange, PyCRAMEpisodes, PyCRAMValues, RunningNode
 from pycrorm_async.memory import Memory
 from pycrorm_async.record.declarations import DeclaredType, RecordedKind
 from pycrorm_async.record.recorded_episode import RecordedEpisode
@@ -486,11 +486,11 @@ class PyCRAMWorld:
                 thread.is_collecting = False
                 self._flush_unless_moving()
 
-    def _change(self, changed: Any) -> Change:
+    def _change(self, changed: Any) -> MotionChange:
         changes = self._episodes.thread.changes
         change = changes.get(id(changed))
         if change is None:
-            changes[id(changed)] = change = Change(changed)
+            changes[id(changed)] = change = MotionChange(changed)
         return change
 
     @guarded

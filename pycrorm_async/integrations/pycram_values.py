@@ -336,7 +336,7 @@ class RunningNode:
         self.key: Hashable | None = None
 
 
-class Change:
+class MotionChange:
     """The last pose of an object and the last positions of its joints that a motion has set."""
 
     def __init__(self, of: Any) -> None:
@@ -353,7 +353,7 @@ class _Thread(threading.local):
 
     def __init__(self) -> None:
         self.nodes: list[RunningNode] = []
-        self.changes: dict[int, Change] = {}
+        self.changes: dict[int, MotionChange] = {}
         self.is_collecting = False
 
 

@@ -55,7 +55,7 @@ EPISODE = "process_metadata_id"
 """The column that names the episode of a row. In `process_metadata` and `simulated_episode` it is `id`."""
 
 
-class Leaf(NamedTuple):
+class LeafTable(NamedTuple):
     """A leaf table as one class or one declaration defines it."""
 
     table: str
@@ -79,7 +79,7 @@ class Schema(msgspec.Struct, frozen=True):
 
     tables: dict[str, dict[str, Storage]]
     indexed: dict[str, list[str]]
-    leaves: list[Leaf]
+    leaves: list[LeafTable]
     comments: dict[str, dict[str, str]]
 
 
@@ -191,7 +191,7 @@ class Contradiction(LayoutConflict):
     """A declaration contradicts another one, so it needs other names."""
 
 
-class DesignatorType(msgspec.Struct, frozen=True):
+class DeclaredType(msgspec.Struct, frozen=True):
     """A dtype's kind, its tables (the oldest first) and the recorded types it descends from."""
 
     kind: str
@@ -208,7 +208,7 @@ class MaterialisedView(msgspec.Struct, frozen=True):
 
 
 class Layout(msgspec.Struct, frozen=True):
-    """Leaf tables by name, designator types by dtype, and users' views of one memory.
+    """LeafTable tables by name, designator types by dtype, and users' views of one memory.
 
     Attributes:
         user_views: SQL of every user's view, by name.
@@ -222,7 +222,7 @@ class Layout(msgspec.Struct, frozen=True):
     """
 
     leaves: dict[str, dict[str, Storage]] = {}
-    types: dict[str, DesignatorType] = {}
+    types: dict[str, DeclaredType] = {}
     user_views: dict[str, str] = {}
     kept: dict[str, MaterialisedView] = {}
     outdated: tuple[str, ...] = ()
@@ -232,13 +232,13 @@ class Layout(msgspec.Struct, frozen=True):
     fault: str | None = None
     unreadable: tuple[str, ...] = ()
 
-    def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
+    def with_leaves(self, leaves: Iterable[LeafTable]) -> Self:
         """Return the layout with the tables of these mapped classes; a declared column or type takes precedence."""
         tables, types = dict(self.leaves), dict(self.types)
         for leaf in leaves:
             tables[leaf.table] = leaf.columns | tables.get(leaf.table, {})
             if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in {*types, *self.renamed}:
-                types[leaf.dtype] = DesignatorType(leaf.kind, (leaf.table,))
+                types[leaf.dtype] = DeclaredType(leaf.kind, (leaf.table,))
         return msgspec.structs.replace(self, leaves=tables, types=types)
 
     def with_views(self, views: Mapping[str, str], kept: Mapping[str, MaterialisedView]) -> Self:
@@ -271,7 +271,7 @@ class Layout(msgspec.Struct, frozen=True):
                 raise Contradiction(
                     f"{each} was renamed to {self.renamed[each]}, so {dtype} cannot have the alias {each}: remove it"
                 )
-        present = self.types.get(dtype) or DesignatorType(declared.kind, ())
+        present = self.types.get(dtype) or DeclaredType(declared.kind, ())
         same_type = [present, *(self.types[each] for each in former if each in self.types)]
         for type_ in same_type:
             if declared.kind != type_.kind:
@@ -297,7 +297,7 @@ class Layout(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(
             self,
             leaves=self.leaves | {declared.table: whole},
-            types=types | {dtype: DesignatorType(declared.kind, tables, declared.bases or present.bases)},
+            types=types | {dtype: DeclaredType(declared.kind, tables, declared.bases or present.bases)},
             renamed=renamed | dict.fromkeys(former, dtype),
         )
 
@@ -365,7 +365,7 @@ class Layout(msgspec.Struct, frozen=True):
         former = [old for old, present in self.renamed.items() if present == dtype]
         return [dtype, *(table for table in reversed(tables) if table != table_name(dtype)), *former]
 
-    def _bases(self, each: DesignatorType) -> list[str]:
+    def _bases(self, each: DeclaredType) -> list[str]:
         """Return the bases of the same kind: a motion is never an action, even if its class derives from one."""
         bases = [self.present_name(base) for base in each.bases]
         return [base for base in bases if base not in self.types or self.types[base].kind == each.kind]

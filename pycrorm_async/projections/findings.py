@@ -24,7 +24,7 @@ from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 _EPISODE_KEYED = ("process_metadata", "simulated_episode")
 
 
-class Difference(NamedTuple):
+class TableDifference(NamedTuple):
     """A row in which a table differs from the log.
 
     Attributes:
@@ -98,7 +98,7 @@ class Comparison:
 
     async def box_differences(
         self, connection: AsyncConnection, boxes: Mapping[str, Sequence[Row]]
-    ) -> list[Difference]:
+    ) -> list[TableDifference]:
         """Return the differences in the boxes of these descriptions, given by fingerprint."""
         stored = await _rows(connection, self._link_box, self._link_box.c.model.in_(sorted(boxes)))
         in_order = itemgetter(*map([*OF_NO_EPISODE[LINK_BOX]].index, self._link_box.columns.keys()))
@@ -108,13 +108,13 @@ class Comparison:
 
     async def differences(
         self, connection: AsyncConnection, rows: FoldedRows, episodes: EpisodeRange
-    ) -> list[Difference]:
+    ) -> list[TableDifference]:
         """Return the differences between the tables and the folded rows of these episodes, in the caller's snapshot."""
         self.count = 0
         folded = defaultdict[str, list[tuple[tuple[str, ...], Sequence[Row]]]](list)
         for (name, columns), some in rows.to_insert().items():
             folded[name].append((columns, some))
-        differences: list[Difference] = []
+        differences: list[TableDifference] = []
         first, end = episodes
         row_range = row_id_min(first), None if end is None else row_id_min(end)
         for name, table in self._tables.items():
@@ -169,7 +169,7 @@ def _key_of(columns: Sequence[str], table: Table | None) -> Callable[[Row], Row]
 
 def _compared(
     name: str, columns: Sequence[str], folded_rows: Mapping[Row, Row], stored_rows: Mapping[Row, Row]
-) -> Iterator[Difference]:
+) -> Iterator[TableDifference]:
     if folded_rows == stored_rows:
         return
     for key in sorted(folded_rows.keys() | stored_rows.keys(), key=_comparable):
@@ -178,11 +178,11 @@ def _compared(
             continue
         number, sequence = (key[0], 1) if name in _EPISODE_KEYED else _event_of(key[0])
         if stored is None or expected is None:
-            yield Difference(number, sequence, name, None, stored, expected)
+            yield TableDifference(number, sequence, name, None, stored, expected)
             continue
         for title, one, other in zip(columns, stored, expected, strict=True):
             if one != other:
-                yield Difference(number, sequence, name, title, one, other)
+                yield TableDifference(number, sequence, name, title, one, other)
 
 
 def _event_of(key: Any) -> tuple[int, int]:
@@ -249,7 +249,7 @@ class VerifyResult:
     damage: int = 0
     drift: int = 0
     damages: list[Damage] = field(default_factory=list)
-    differences: list[Difference] = field(default_factory=list)
+    differences: list[TableDifference] = field(default_factory=list)
     remarks: int = 0
     not_compared: Mapping[str, str] = field(default_factory=dict)
     stopped: list[StoppedEpisode] = field(default_factory=list)
@@ -287,7 +287,7 @@ class VerifyResult:
         self.without_digest += 1
         self._without_digest.add(number)
 
-    def add_difference(self, difference: Difference) -> None:
+    def add_difference(self, difference: TableDifference) -> None:
         """Count a difference and keep it, unless there are many."""
         self.drift += 1
         self._drifted.add(difference.number)

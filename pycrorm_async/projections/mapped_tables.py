@@ -23,20 +23,20 @@ from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
-from pycrorm_async.projections.columns import EPISODE, SCHEMA, Layout, Leaf, MaterialisedView, Storage
+from pycrorm_async.projections.columns import EPISODE, SCHEMA, Layout, LeafTable, MaterialisedView, Storage
 
 if TYPE_CHECKING:
     from pycrorm_async.orm import Designator
 
 
-def mapped_leaves() -> list[Leaf]:
+def mapped_leaves() -> list[LeafTable]:
     """Return the tables of all classes below `Designator` that every memory of this process shares."""
     orm = sys.modules.get("pycrorm_async.orm")
     declared = [] if orm is None else [each for each in leaves_of(orm.Designator) if each.dtype is None]
     return [*SCHEMA.leaves, *declared]
 
 
-def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
+def leaves_of(root: type[Designator]) -> Iterator[LeafTable]:
     """Yield the tables of the classes below `root` and of itself, built-in or declared by a user."""
     from pycrorm_async.orm import Action, Designator, Language, Motion
     from pycrorm_async.orm.base import is_built_in
@@ -50,7 +50,7 @@ def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
             continue
         columns = {str(each.name): column_storage(each) for each in table.columns if each.name not in ("id", EPISODE)}
         named = (mapper.class_.__name__, mapper.class_.__root__.lower()) if is_built_in(mapper.class_) else ()
-        yield Leaf(str(table.name), columns, *named)
+        yield LeafTable(str(table.name), columns, *named)
 
 
 def column_storage(column: Column[Any]) -> Storage:

@@ -27,10 +27,10 @@ from pycrorm_async.projections.custom import (
 )
 from pycrorm_async.projections.findings import (
     Comparison,
-    Difference,
     EpisodeRange,
     StoppedEpisode,
     TableCheck,
+    TableDifference,
     Unreadable,
     VerifyResult,
 )
@@ -289,7 +289,7 @@ class EpisodeCheck:
         elif self._ended_wall_ns != episode.ended_wall_ns:
             self._damaged(span.last, f"the episode's ended_wall_ns is {episode.ended_wall_ns}{_OTHER_TIME}")
 
-    def hides(self, difference: Difference) -> bool:
+    def hides(self, difference: TableDifference) -> bool:
         """Return whether to suppress a difference, because lost events make its expected row unknown."""
         if self._lost is None:
             return False
@@ -655,7 +655,7 @@ class _TablesCheck:
                 self._result.add_difference(each)
         self._check_superfluous([each for each in differences if each.is_superfluous and each.number])
 
-    def _check_superfluous(self, rows: Iterable[Difference]) -> None:
+    def _check_superfluous(self, rows: Iterable[TableDifference]) -> None:
         """Report the events and episodes that the log does not have, although the tables have their rows."""
         last: dict[int, int] = {}
         read = self._episodes
@@ -710,7 +710,7 @@ class ProjectionCheck:
         self._comparison: Comparison | None = None
         self._part = EpisodeRange()
         self._folded: dict[int, int] = {}
-        self._refused: dict[int, Difference] = {}
+        self._refused: dict[int, TableDifference] = {}
         self._lost: set[int] = set()
 
     async def begin(self, connection: AsyncConnection, part: EpisodeRange, _: Sequence[EpisodeRow]) -> bool:
@@ -743,7 +743,7 @@ class ProjectionCheck:
             refused = after + len(whole) + 1, "it is missing in the log"
         if refused is not None:
             sequence, reason = refused
-            self._refused[number] = Difference(
+            self._refused[number] = TableDifference(
                 number, sequence, self._projection.name, "fold", "folded in the tables", f"parked: {reason}"
             )
 
@@ -760,7 +760,7 @@ class ProjectionCheck:
 
     async def differences(
         self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
-    ) -> Sequence[Difference]:
+    ) -> Sequence[TableDifference]:
         """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
         assert isinstance(rows, CustomRows)
         differences = await comparison.differences(connection, rows, episodes)

@@ -42,7 +42,7 @@ CORE_VIEWS = (
 
 
 @dataclass(frozen=True)
-class Column:
+class ColumnDescription:
     """A column of a view.
 
     Attributes:
@@ -68,7 +68,7 @@ class View:
     name: str
     text: str
     mapped: str | None
-    columns: tuple[Column, ...]
+    columns: tuple[ColumnDescription, ...]
 
 
 async def read_schema(reading: Reading, names: Sequence[str] = ()) -> list[View]:
@@ -107,9 +107,9 @@ def _type_text(kind: Any) -> str:
 def _view(name: str, columns: Iterable[tuple[str, str]], words: ViewDescription | None, dtype: str | None) -> View:
     if words is None:
         text = f"Parameters of {dtype}; `id` is that of its row in action, motion or language." if dtype else ""
-        return View(name, text, None, tuple(Column(*each) for each in columns))
+        return View(name, text, None, tuple(ColumnDescription(*each) for each in columns))
     described_columns = (
-        Column(each, kind, words.columns.get(each, ""), words.references.get(each)) for each, kind in columns
+        ColumnDescription(each, kind, words.columns.get(each, ""), words.references.get(each)) for each, kind in columns
     )
     return View(name, words.text, words.mapped, tuple(described_columns))
 

@@ -62,7 +62,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
-from pycrorm_async.projections.findings import Comparison, Difference, EpisodeRange, TableCheck, VerifyResult
+from pycrorm_async.projections.findings import Comparison, EpisodeRange, TableCheck, TableDifference, VerifyResult
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.generations import select_generation
 from pycrorm_async.projections.pipeline import Batch
@@ -122,7 +122,7 @@ class CaseCheck(ProjectionCheck):
 
     async def differences(
         self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
-    ) -> Sequence[Difference]:
+    ) -> Sequence[TableDifference]:
         assert isinstance(rows, CaseBatch)
         number = comparison.generation.number
         end = EPISODE_NUMBER_MAX + 1 if episodes.end is None else episodes.end
@@ -136,7 +136,7 @@ class CaseCheck(ProjectionCheck):
         folded = Block.of(rows.cases) if rows.cases else None
         expected = {each.node: each for each in _without(left_out, folded.cases() if folded is not None else ())}
         stored: dict[int, Case] = {}
-        differences: list[Difference] = []
+        differences: list[TableDifference] = []
         for block in blocks:
             for case in _without(left_out, _of_episodes(block, episodes.first, end)):
                 self.result.rows += 1
@@ -166,7 +166,7 @@ class CaseCheck(ProjectionCheck):
 
     def _report(self, heading: BlockHeading, fault: str) -> None:
         self.result.add_difference(
-            Difference(heading.episode_min, 1, BLOCKS, f"block {heading.number}", fault, "as it was written")
+            TableDifference(heading.episode_min, 1, BLOCKS, f"block {heading.number}", fault, "as it was written")
         )
 
 
@@ -176,7 +176,7 @@ def _of_episodes(block: Block, first: int, end: int) -> Iterator[Case]:
             yield group.case(row)
 
 
-def _compared(node: int, stored: Case | None, expected: Case | None) -> Iterator[Difference]:
+def _compared(node: int, stored: Case | None, expected: Case | None) -> Iterator[TableDifference]:
     if stored == expected:
         return
     if stored is None or expected is None:
@@ -189,9 +189,9 @@ def _compared(node: int, stored: Case | None, expected: Case | None) -> Iterator
                 yield _difference(node, name, was.get(name), should.get(name))
 
 
-def _difference(node: int, column: str | None, stored: Any, expected: Any) -> Difference:
+def _difference(node: int, column: str | None, stored: Any, expected: Any) -> TableDifference:
     number, sequence, _ = row_key(node)
-    return Difference(number, sequence, BLOCKS, column, stored, expected)
+    return TableDifference(number, sequence, BLOCKS, column, stored, expected)
 
 
 def _without(features: frozenset[str], cases: Iterable[Case]) -> Iterator[Case]:

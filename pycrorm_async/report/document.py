@@ -413,7 +413,7 @@ class Texts:
 
 
 @dataclass(slots=True)
-class RecordedObject:
+class TracksOfObject:
     """The tracks of an object from its `ObjectAdded` to its `ObjectRemoved` (`removed` is None if it stayed)."""
 
     poses: Track
@@ -439,7 +439,7 @@ class ObjectTracks:
     def __init__(self, world: ReplayedWorld, first: int) -> None:
         self._world = world
         self._first = first
-        self.objects: dict[int, RecordedObject] = {}
+        self.objects: dict[int, TracksOfObject] = {}
         self.attachments: list[list[Any]] = []
         self.samples: dict[int, dict[str, Track]] = {}
         self.full_until: int | None = None
@@ -473,7 +473,7 @@ class ObjectTracks:
         self._removals_from = None
 
     def _add(self, sequence: int, added: ObjectAdded) -> None:
-        self.objects[sequence] = RecordedObject(Track(self._first))
+        self.objects[sequence] = TracksOfObject(Track(self._first))
         self._move(sequence, sequence, added.pose)
         self._set_joints(sequence, sequence, added.joints)
         self.full_until = None

@@ -18,7 +18,7 @@ from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections import custom, pipeline
 from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection, learner_of, states
-from pycrorm_async.projections.findings import Difference
+from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.generations import PROJECTION
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.pipeline import FoldRunner, SideTarget
@@ -443,9 +443,9 @@ async def test_verify_finds_every_change_and_nothing_else(log: EventLog, monkeyp
             await connection.exec_driver_sql(change)
     result = await verify(log, projections=[GraspRate()])
     assert result.differences == [
-        Difference(2, 3, "grasp_try", "arm", "BOTH", "LEFT"),
-        Difference(2, 5, "grasp_try", None, None, second),
-        Difference(9, 5, "grasp_try", None, (row(5, number=9), 9, None, None, None), None),
+        TableDifference(2, 3, "grasp_try", "arm", "BOTH", "LEFT"),
+        TableDifference(2, 5, "grasp_try", None, None, second),
+        TableDifference(9, 5, "grasp_try", None, (row(5, number=9), 9, None, None, None), None),
     ]
     (only,) = [each for each in await log.episodes() if each.number == 1]
     assert (await verify(log, episode=only, projections=[GraspRate()])).drift == 0

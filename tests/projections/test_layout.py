@@ -14,7 +14,7 @@ from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import PickUpAction, TaskTreeNode
 from pycrorm_async.projections import projector
-from pycrorm_async.projections.columns import Layout, LayoutConflict, Leaf
+from pycrorm_async.projections.columns import Layout, LayoutConflict, LeafTable
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.projections.views import public_views
@@ -90,7 +90,7 @@ def test_a_contradiction_with_another_table_of_the_same_type_is_refused() -> Non
 
 
 def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the_type() -> None:
-    layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
+    layout = layout_of(SAYING).with_leaves([LeafTable("ORMSaying", {"text": "real"})])
     with pytest.raises(LayoutConflict, match=r"SayingAction\.text is declared as text and as real"):
         layout.with_declaration(declared("SayingAction", "ORMSaying", field("volume", "real", 2)))
     assert layout.with_declaration(SAYING) == layout
@@ -116,7 +116,10 @@ def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_an_exis
 
 def test_mapped_classes_add_missing_columns_and_never_change_declared_ones() -> None:
     layout = layout_of(SAYING).with_leaves(
-        [Leaf("saying_action", {"text": "integer", "volume": "real"}, "SayingAction", "action"), Leaf("ORMLog", {})]
+        [
+            LeafTable("saying_action", {"text": "integer", "volume": "real"}, "SayingAction", "action"),
+            LeafTable("ORMLog", {}),
+        ]
     )
     assert layout.leaves == {"saying_action": {"text": "text", "volume": "real"}, "ORMLog": {}}
     assert layout.types["SayingAction"].tables == ("saying_action",)

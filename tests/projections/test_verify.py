@@ -16,7 +16,7 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.types import EpisodeEnded, NodeStarted
 from pycrorm_async.projections import verify as parts
-from pycrorm_async.projections.findings import Difference
+from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.log import EventLog
@@ -221,7 +221,8 @@ async def test_every_changed_value_is_reported_and_nothing_else(log: EventLog, d
         result = await look(log)
         number, sequence = event_of(table, row)
         assert result.differences == [
-            Difference(number, sequence, table.name, column, value, row[column]) for column, value in values.items()
+            TableDifference(number, sequence, table.name, column, value, row[column])
+            for column, value in values.items()
         ]
         assert (result.drift, result.damage) == (len(values), 0)
         set_columns(database_url, table, row, {each: row[each] for each in values})
@@ -235,7 +236,7 @@ async def test_a_deleted_row_is_reported(log: EventLog, database_url: str) -> No
             delete(database_url, table, row)
             number, sequence = event_of(table, row)
             whole = tuple(row[each] for each in table.columns)
-            assert (await look(log)).differences == [Difference(number, sequence, table.name, None, None, whole)]
+            assert (await look(log)).differences == [TableDifference(number, sequence, table.name, None, None, whole)]
             ask_to_change(database_url, insertion(table, row))
     assert_clean(await look(log))
 
@@ -258,7 +259,7 @@ async def test_a_row_without_an_event_is_reported_in_every_table(
         added["id" if "id" in table.key else table.key[0]] = number if of_episode else number * 2**31 + sequence * 32
         insertions.append(insertion(table, added))
         event = (number, 1) if of_episode else (number, sequence)
-        expected.append(Difference(*event, table.name, None, tuple(added[each] for each in table.columns), None))
+        expected.append(TableDifference(*event, table.name, None, tuple(added[each] for each in table.columns), None))
     change_each(database_url, insertions)
     result = await look(log)
     assert sorted(result.differences, key=repr) == sorted(expected, key=repr)
