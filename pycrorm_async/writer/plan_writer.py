@@ -471,6 +471,7 @@ class WriterThread:
             self._request_stop(cancel=True)
             await asyncio.wait([ended], timeout=_STOP_S)
             if ended.done():
+                self._thread.join()
                 ended.exception()  # retrieved, so that it is not logged; the timeout is raised instead
             raise timeout
         self._thread.join()

@@ -72,7 +72,7 @@ def test_an_impossible_call_is_reported_in_one_line(folder: Path, arguments: lis
     done = pycrorm(*arguments, cwd=folder)
     assert line in one_line_of(done)
     assert done.returncode == code
-    assert done.stdout == ""
+    assert arguments[0] == "status" or done.stdout == ""  # `status` also describes the spool
 
 
 @pytest.mark.parametrize(

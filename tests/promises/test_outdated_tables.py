@@ -25,6 +25,7 @@ from pycrorm_async.store.log import EventLog
 from tests.commands import run_script
 from tests.databases import ask, ask_to_change, put_memory
 from tests.golden.unpacking import unpack_memory_v1
+from tests.writer.running_writers import until
 
 pytestmark = pytest.mark.slow
 OLD = PROJECTION_VERSION - 1
@@ -139,6 +140,7 @@ async def test_a_plan_whose_events_another_process_stores_waits_for_no_rebuild(
             await rebuild.rebuild_memory(database_url)  # beside the daemon, which goes on folding
             async with memory.episode(description="steps"):
                 await StepActionPerformable(4).perform()
+            await until(lambda: numbers_in(database_url) == [1, 2, 3, 4])  # the daemon tries to fold again at intervals
         else:
             serving.close()
             await memory.synced()
