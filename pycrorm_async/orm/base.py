@@ -83,7 +83,7 @@ def _decoded(text: str | None) -> Any:
     return None if text is None else msgspec.json.decode(text)
 
 
-class UtcMoment(TypeDecorator[datetime]):
+class Moment(TypeDecorator[datetime]):
     """An aware datetime, exact to the microsecond and read in UTC. A naive one is refused: it names no time zone."""
 
     impl = BigInteger
@@ -270,7 +270,7 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
         float: Double(),
         str: Text(),
         bool: Boolean(),
-        datetime: UtcMoment(),
+        datetime: Moment(),
         **{enum: EnumOfObject(enum) for enum in (Arms, Grasp, GripperState, ObjectType, TaskStatus)},
     }
 
