@@ -250,7 +250,7 @@ class LogFollower:
 
 
 async def wait_unless(stop: asyncio.Event, waiting: Awaitable[Any]) -> None:
-    """Wait for something, or until `stop` is set; what still waits then is cancelled."""
+    """Wait until the awaitable ends or `stop` is set, whichever is first, and cancel the other wait."""
     tasks = [asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

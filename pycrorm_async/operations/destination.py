@@ -368,10 +368,10 @@ def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
 
 
 def stored_heads(spool: Path, log_id: str) -> dict[EpisodeId, int]:
-    """Return heads that the log must have reached, by episode; the last ones last. Raises `FilesError` and `OSError`.
+    """Return the sequences that the log must have reached, by episode; the latest come last.
 
-    Of each recorder with kept segments that is the last event of these; of a living recorder that another process
-    drains, each episode in its folder.
+    A recorder with kept segments contributes their last event. A living recorder that another process drains
+    contributes each episode in its folder. Raises `FilesError` and `OSError`.
     """
     heads: dict[EpisodeId, int] = {}
     newest: dict[Path, Path] = {}  # by folder, the one kept last at the end

@@ -319,7 +319,7 @@ def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, F
 
 
 def last_event(buffer: Buffer, salt: int) -> Frame | None:
-    """Find the last whole frame with an event, from the end of the segment; None without one."""
+    """Search the segment from its end for the last whole frame with an event; None if it has no event."""
     salted = CHECKSUM.pack(salt)
     index = buffer.rfind(salted)
     while index >= 0:

@@ -521,7 +521,7 @@ def _defaults(value: msgspec.Struct) -> dict[str, Any]:
 
 
 def _recordable(value: Any, defaults: Mapping[str, Any], name: str) -> Any:
-    """Return what JSON can hold of a field, or its default. Raises `NotEncodable` if that is nothing, without one."""
+    """Return the part of a field that JSON can hold, else its default. Raises `NotEncodable` if it has neither."""
     try:
         return _clean(value)
     except NotEncodable:
@@ -531,7 +531,7 @@ def _recordable(value: Any, defaults: Mapping[str, Any], name: str) -> Any:
 
 
 def _clean(value: Any) -> Any:
-    """Clean texts, and leave out items and entries that JSON cannot hold. Raises `NotEncodable` if nothing is left."""
+    """Clean texts, and leave out items and entries that JSON cannot hold. Raises `NotEncodable` if none remain."""
     if isinstance(value, str):
         return clean(value)
     if isinstance(value, msgspec.Struct):

@@ -175,7 +175,7 @@ class Episode(EpisodeWriter):
         return sequence if sequence != self._root else None
 
     def robot_state(self) -> RobotValue | None:
-        """Return the state of the robot that acts in this context; None without one, and in a second world."""
+        """Return the state of the robot that acts in this context; None if no robot acts, or in a second world."""
         if self.world is None:
             return None
         if not self.acts_in_recorded_world:
