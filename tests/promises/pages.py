@@ -58,7 +58,7 @@ _FENCE: Final = re.compile(
     r"^(?P<indent> *)```(?P<language>\S*)\n(?P<text>.*?)^(?P=indent)```$", re.MULTILINE | re.DOTALL
 )
 _HEADING: Final = re.compile(r"^#+ (.*)$", re.MULTILINE)
-_SAVED: Final = re.compile(r"\b(?:save|append)\b[^`]* `([\w.]+\.py)`", re.IGNORECASE)
+_SAVED: Final = re.compile(r"\b(?:save|append)\b[^`]*\s`([\w.]+\.py)`", re.IGNORECASE)
 _RUN: Final = re.compile(r"<!-- run: (.+?) -->")
 
 
