@@ -1,0 +1,425 @@
+"""An `Intake` takes the episodes of one import: a format gives it what its files hold, and it records or only counts.
+
+Theory of operation. A format reads its files in order and calls the methods of `IntakeEpisode`, which are those of
+`RecordedEpisode` with the time of each call. The intake leaves out what would record nothing, such as a pose that has
+not changed, before it counts, so the counts of a dry run are those of the import. An episode has the id of its name
+(`recording.episode(id=...)`), so an episode that the memory holds already is not recorded again.
+
+Whatever comes from a file is data: names become types and columns only through `Recording.type`, and a file with very
+many different names gets few types (`TYPES_MAX`, `FIELDS_MAX`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, Protocol, Self, TypeAlias
+
+import msgspec
+
+from pycrorm_async.errors import CallerError, FilesError
+from pycrorm_async.events.types import NodeStatus, PoseValue
+from pycrorm_async.progress_bar import ProgressCallback
+from pycrorm_async.record.declarations import FieldSpec
+from pycrorm_async.record.recording import Recording
+from pycrorm_async.record.values import json_text
+
+TYPES_MAX: Final = 200
+"""Bounds the types of nodes that one import declares, because each has a table. Further names share one type."""
+FIELDS_MAX: Final = 40
+"""Bounds the fields of a type that an import declares; further parameters are JSON in the field `further`."""
+_IDENTITY_BYTES = 2**20
+"""The bytes at both ends of a file that identify it, so that a large bag is not read twice."""
+
+Numbers: TypeAlias = Sequence[float]
+
+
+class ObjectKey(NamedTuple):
+    """A parameter that is an object, by the key with which it was added."""
+
+    key: Hashable
+
+
+class FileCut(FilesError):
+    """A file ends in the middle of a record; what stands before is imported."""
+
+
+class WrongFormat(CallerError):
+    """A file is not of the format that the caller named."""
+
+
+class MapFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The settings of an import, from its map file. Each format has a subclass with the keys of its own.
+
+    Attributes:
+        name: distinguishes imports of the same files: another name makes other episodes.
+        description: of the episodes, instead of the one in the file.
+        tags: of the episodes.
+    """
+
+    name: str = ""
+    description: str = ""
+    tags: tuple[str, ...] = ()
+
+
+class ImportFormat(NamedTuple):
+    """A format of files that can be imported.
+
+    Attributes:
+        read: gives the episodes of a file or folder to the intake. Raises `WrongFormat` and `FileCut`.
+        describes: the files, in one line.
+        map_file: the class of its settings.
+    """
+
+    read: Callable[[Path, Any, Intake], None]
+    describes: str
+    map_file: type[MapFile] = MapFile
+
+
+@dataclass
+class EpisodeReport:
+    """An episode of an import.
+
+    Attributes:
+        name: from which its id is made.
+        state: `imported`, or `already stored`; of a dry run `would be imported`.
+        nodes, objects: the number of nodes and of objects.
+        changes: the number of moves of objects and of joints.
+        removals: the number of objects that left the world.
+        samples: the number of blocks of samples.
+        observations: the number of observations.
+        statuses: how many nodes ended with each status.
+    """
+
+    name: str
+    description: str
+    state: Literal["imported", "would be imported", "already stored"]
+    nodes: int = 0
+    objects: int = 0
+    changes: int = 0
+    removals: int = 0
+    samples: int = 0
+    observations: int = 0
+    statuses: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass
+class ImportReport:
+    """The outcome of an import.
+
+    Attributes:
+        left_out: the number of parts of the files that are not recorded, by what they are and the reason.
+        cut: the reason why reading a file ended before its end, one line for each file.
+    """
+
+    format: str
+    episodes: list[EpisodeReport] = field(default_factory=list)
+    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+    cut: list[str] = field(default_factory=list)
+
+
+class StoredEpisodes(Protocol):
+    """Answers whether the memory holds a whole episode of this name."""
+
+    def __call__(self, name: str, /) -> bool: ...
+
+
+class Intake:
+    """Takes the episodes of one import.
+
+    Args:
+        recording: of the memory; None only counts.
+        is_stored: whether the memory holds the episode of a name already.
+        report_progress: gets what is done and the total, in a unit of the format's choice.
+    """
+
+    def __init__(
+        self,
+        format_name: str,
+        settings: MapFile,
+        recording: Recording | None = None,
+        is_stored: StoredEpisodes = lambda _name: False,
+        report_progress: ProgressCallback | None = None,
+    ) -> None:
+        self.report: Final = ImportReport(format_name)
+        self.settings = settings
+        self.recording = recording
+        self._is_stored = is_stored
+        self._report_progress = report_progress
+        self._types: dict[str, dict[str, FieldSpec]] = {}
+
+    def episode(
+        self,
+        name: str,
+        at: int,
+        *,
+        description: str,
+        plan: str | None = None,
+        tags: Sequence[str] = (),
+        metadata: Mapping[str, Any] = {},
+    ) -> IntakeEpisode:
+        """Open an episode; use it with `with`.
+
+        Args:
+            name: the same for the same content (`identity_of`), so that it is imported once.
+            at: when it began, in ns since 1970.
+            metadata: JSON values; `imported_from` and the format are added.
+        """
+        settings, format_name = self.settings, self.report.format
+        full_name = "/".join(filter(None, ("import", format_name, settings.name, name)))
+        text = settings.description or description
+        report = EpisodeReport(full_name, text, "imported" if self.recording is not None else "would be imported")
+        self.report.episodes.append(report)
+        if self._is_stored(full_name):
+            report.state = "already stored"
+            return IntakeEpisode(self, report, None, at)
+        recorded = None
+        if self.recording is not None:
+            open_episode: Any = self.recording.episode
+            recorded = open_episode(
+                id=full_name,
+                at=at,
+                description=text,
+                plan=plan,
+                tags=(*settings.tags, *(each for each in tags if each not in settings.tags)),
+                metadata={"import": format_name, **metadata},
+            )
+        return IntakeEpisode(self, report, recorded, at)
+
+    def left_out(self, what: str, why: str, count: int = 1) -> None:
+        """Count parts of a file that are not recorded."""
+        self.report.left_out[what, why] += count
+
+    def cut(self, path: Path, reason: str) -> None:
+        """Note that the rest of a file cannot be read."""
+        self.report.cut.append(f"{path} {reason}")
+
+    def progress(self, done: int, total: int) -> None:
+        """Report the progress of reading."""
+        if self._report_progress is not None:
+            self._report_progress(done, total)
+
+    def typed(self, dtype: str, parameters: Mapping[str, Any]) -> tuple[str, dict[str, FieldSpec], dict[str, Any]]:
+        """Return the dtype, the fields and the parameters of a node, as the types of this import allow them."""
+        if dtype not in self._types and len(self._types) >= TYPES_MAX:
+            self.left_out("types", f"a file has at most {TYPES_MAX} of its own; these nodes are of the type Step")
+            dtype, parameters = "Step", {"name": dtype, **parameters}
+        declared = self._types.setdefault(dtype, {})
+        fields: dict[str, FieldSpec] = {}
+        values: dict[str, Any] = {}
+        further: dict[str, Any] = {}
+        for name, value in parameters.items():
+            if value is None:
+                continue
+            if name not in declared and len(declared) >= FIELDS_MAX:
+                further[name] = value
+                continue
+            spec, values[name] = _recorded(value)
+            fields[name] = declared[name] = spec
+        if further:
+            fields["further"], values["further"] = "text", json_text(further)
+        return dtype, fields, values
+
+
+class IntakeEpisode:
+    """An episode of an import. Times are in ns since 1970; one before that of the call before is recorded as it is.
+
+    Attributes:
+        is_stored: whether the memory holds the episode already, so that its calls record nothing.
+    """
+
+    def __init__(self, intake: Intake, report: EpisodeReport, recorded: Any, at: int) -> None:
+        self.is_stored: Final = report.state == "already stored"
+        self._intake = intake
+        self._report = report
+        self._recorded = recorded
+        self._last = at
+        self._open: dict[Hashable, None] = {}
+        self._poses: dict[Hashable, tuple[float, ...]] = {}
+        self._joints: dict[Hashable, dict[str, float]] = {}
+        self._status: Any = "UNKNOWN"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """End the episode and what is open in it; if reading failed, leave it open, so that it can be continued."""
+        if error is None:
+            self._end_all()
+
+    def start(
+        self,
+        key: Hashable,
+        kind: Literal["action", "motion", "language"],
+        dtype: str,
+        parameters: Mapping[str, Any],
+        at: int,
+        *,
+        parent: Hashable | None = None,
+        robot: Hashable | None = None,
+    ) -> None:
+        """Record that a node started. Its fields have the types of the values: texts, numbers, booleans, poses."""
+        self._last = max(self._last, at)
+        if self.is_stored:
+            return
+        self._report.nodes += 1
+        self._open[key] = None
+        dtype, fields, values = self._intake.typed(dtype, parameters)
+        if self._recorded is not None and self._intake.recording is not None:
+            declared = self._intake.recording.type(kind, dtype, fields)
+            self._recorded.start(key, declared, values, parent=parent, robot=robot, at=at)
+
+    def end(
+        self,
+        key: Hashable,
+        status: NodeStatus | Literal["UNKNOWN"],
+        at: int,
+        *,
+        failure: tuple[str, str] | str | None = None,
+        result: Any = None,
+    ) -> None:
+        """Record that a node ended; nothing if it is not open."""
+        self._last = max(self._last, at)
+        if key not in self._open:
+            return
+        del self._open[key]
+        self._report.statuses[status] += 1
+        if self._recorded is not None:
+            self._recorded.end(key, status, failure, result, at=at)
+
+    def is_open(self, key: Hashable) -> bool:
+        """Return whether a node with this key has started and not ended."""
+        return key in self._open
+
+    def object_added(
+        self, key: Hashable, name: str, object_type: str, pose: PoseValue, at: int, *, urdf: str | None = None
+    ) -> None:
+        """Record that an object is in the world from now on."""
+        self._last = max(self._last, at)
+        if self.is_stored:
+            return
+        self._report.objects += 1
+        self._poses[key] = (*pose.position, *pose.orientation)
+        self._joints[key] = {}
+        if self._recorded is not None:
+            self._recorded.object_added(key, name, object_type, pose, urdf=urdf, at=at)
+
+    def has_object(self, key: Hashable) -> bool:
+        """Return whether an object of this key was added."""
+        return key in self._poses
+
+    def object_moved(
+        self, key: Hashable, pose: PoseValue, at: int, *, name: str = "", object_type: str = "UNKNOWN"
+    ) -> None:
+        """Record the pose of an object, unless it is the same as before; for a new key add it under this name."""
+        if key not in self._poses:
+            self.object_added(key, name or str(key), object_type, pose, at)
+            return
+        self._last = max(self._last, at)
+        numbers = (*pose.position, *pose.orientation)
+        if self.is_stored or self._poses.get(key) == numbers:
+            return
+        self._poses[key] = numbers
+        self._report.changes += 1
+        if self._recorded is not None:
+            self._recorded.object_moved(key, pose, at=at)
+
+    def object_removed(self, key: Hashable, at: int) -> None:
+        """Record that an object left the world; nothing if it is not there."""
+        self._last = max(self._last, at)
+        if self._poses.pop(key, None) is None:
+            return
+        del self._joints[key]
+        self._report.removals += 1
+        if self._recorded is not None:
+            self._recorded.object_removed(key, at=at)
+
+    def joints_moved(self, key: Hashable, joints: Mapping[str, float], at: int) -> None:
+        """Record the positions of joints (rad or m) that have changed and are finite."""
+        self._last = max(self._last, at)
+        before = self._joints.get(key)
+        if self.is_stored or before is None:
+            return
+        changed = {name: each for name, each in joints.items() if before.get(name) != each and math.isfinite(each)}
+        if not changed:
+            return
+        before.update(changed)
+        self._report.changes += 1
+        if self._recorded is not None:
+            self._recorded.joints_moved(key, changed, at=at)
+
+    def sampled(self, key: Hashable, channels: Sequence[str], values: Sequence[Numbers], at: Sequence[int]) -> None:
+        """Record a block of samples of an object: for each time, a number for each channel."""
+        if not at:
+            return
+        self._last = max(self._last, at[-1])
+        if self.is_stored:
+            return
+        self._report.samples += 1
+        if self._recorded is not None:
+            self._recorded.sampled(key, channels, values, at)
+
+    def observe(self, name: str, values: object, at: int, *, node: Hashable | None = None) -> None:
+        """Record an observation, of the node if that is open, else of the episode."""
+        self._last = max(self._last, at)
+        if self.is_stored:
+            return
+        self._report.observations += 1
+        if self._recorded is not None:
+            self._recorded.observe(name, values, node=node if node in self._open else None, at=at)
+
+    def ended(self, status: Any, at: int | None = None) -> None:
+        """Set how the episode ended (UNKNOWN by default), and when, if that is after its last event."""
+        self._status = status
+        self._last = max(self._last, at or 0)
+
+    def _end_all(self) -> None:
+        """End the nodes that never ended, the innermost first, and the episode."""
+        for key in reversed(list(self._open)):
+            self.end(key, "UNKNOWN", self._last)
+        if self._recorded is not None:
+            self._recorded.close(status=self._status, at=self._last)
+
+
+def _recorded(value: Any) -> tuple[FieldSpec, Any]:
+    """Return the type of the field of a value from a file, and the value to record."""
+    match value:
+        case bool():
+            return "boolean", value
+        case int() | float():
+            return "real", value
+        case str():
+            return "text", value
+        case ObjectKey():
+            return "object", value.key
+        case PoseValue():
+            return "pose", value
+        case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation} if all(
+            isinstance(each, int | float) for each in (*position, *orientation)
+        ):
+            return "pose", pose_at(position, orientation, 0)
+    return "text", json_text(value)
+
+
+def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map") -> PoseValue:
+    """Return a pose from a position (m) and a quaternion xyzw; `at` is its time in ns since 1970."""
+    x, y, z = map(float, position)
+    qx, qy, qz, qw = map(float, orientation)
+    return PoseValue((x, y, z), (qx, qy, qz, qw), frame, at)
+
+
+def identity_of(path: Path, *further: Path) -> str:
+    """Return what identifies files by their content: a digest of their sizes and of the bytes at both ends of each."""
+    digest = hashlib.sha256()
+    for each in (path, *further):
+        size = each.stat().st_size
+        digest.update(size.to_bytes(8))
+        with each.open("rb") as file:
+            digest.update(file.read(_IDENTITY_BYTES))
+            file.seek(max(_IDENTITY_BYTES, size - _IDENTITY_BYTES))
+            digest.update(file.read(_IDENTITY_BYTES))
+    return digest.hexdigest()[:32]

@@ -1,0 +1,96 @@
+"""Find the format of an import by its name, read its map file, and run it on a memory, or count what it would record.
+
+>>> import_files("trace", ["run.json"], Memory.sync("sqlite:///memory.db"))
+ImportReport(format='trace', episodes=[EpisodeReport(name='import/trace/…', …)], …)
+
+A package adds a format with an entry point in the group `pycrorm.import_formats`, whose name is that of the format and
+whose value is an `ImportFormat`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from importlib.metadata import entry_points
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.imports.intake import FileCut, ImportFormat, ImportReport, Intake, MapFile
+from pycrorm_async.progress_bar import ProgressCallback
+from pycrorm_async.query.text import nearest
+from pycrorm_async.record.recording import Recording
+
+GROUP: Final = "pycrorm.import_formats"
+"""The group of the entry points of formats."""
+_BUILT_IN: Final = {"trace": "trace"}
+"""The modules of the built-in formats, by name, loaded when they are used. `FORMAT` in each is its `ImportFormat`."""
+
+
+def format_names() -> list[str]:
+    """Return the names of the built-in formats, and of those that installed packages offer."""
+    return [*_BUILT_IN, *sorted({each.name for each in entry_points(group=GROUP)} - _BUILT_IN.keys())]
+
+
+def format_named(name: str) -> ImportFormat:
+    """Return the format of this name. Raises `CallerError`."""
+    if name in _BUILT_IN:
+        built_in: ImportFormat = import_module(f"pycrorm_async.imports.{_BUILT_IN[name]}").FORMAT
+        return built_in
+    offered = next(iter(entry_points(group=GROUP, name=name)), None)
+    if offered is None:
+        names = format_names()
+        raise CallerError(f"there is no format {name!r}{nearest(name, names)}; formats: {', '.join(names)}")
+    loaded: ImportFormat = offered.load()
+    return loaded
+
+
+def read_map_file(path: Path | None, map_file: type[MapFile]) -> MapFile:
+    """Read the settings of an import. Raises `CallerError` for a file that cannot be read, or has an unknown key."""
+    if path is None:
+        return map_file()
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=map_file)
+    except OSError as error:
+        raise CallerError(f"the map file {path} cannot be read: {error.strerror or error}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        keys = ", ".join(map_file.__struct_fields__)
+        raise CallerError(f"the map file {path} does not fit: {error}; keys of this format: {keys}") from None
+
+
+def import_files(
+    file_format: str,
+    paths: Iterable[str | PathLike[str]],
+    recording: Recording | None,
+    *,
+    map_file: Path | None = None,
+    report_progress: ProgressCallback | None = None,
+) -> ImportReport:
+    """Import files into the memory of `recording`; without one, count what would be recorded.
+
+    Each path is read apart, and a path that is cut in the middle does not stop the next one. An episode that the memory
+    holds already is not recorded again.
+
+    Raises:
+        CallerError: the format, the map file or a path is unknown, or a file is of another format. Nothing of that path
+            is recorded then.
+        MissingExtra: the format needs a package that is not installed.
+    """
+    chosen = format_named(file_format)
+    settings = read_map_file(map_file, chosen.map_file)
+    present: Sequence[Path] = [Path(each) for each in paths]
+    for path in present:
+        if not path.exists():
+            raise CallerError(f"{path} does not exist")
+    intake = Intake(file_format, settings, recording, report_progress=report_progress)
+    for path in present:
+        try:
+            chosen.read(path, settings, intake)
+        except FileCut as error:
+            intake.cut(path, str(error))
+        except OSError as error:
+            raise CallerError(f"{path} cannot be read: {error.strerror or error}") from None
+    return intake.report

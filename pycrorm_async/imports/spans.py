@@ -1,0 +1,109 @@
+"""A `Span` is a node with its interval; `give_spans` gives a tree of them to an episode in the order of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+from pycrorm_async.events.types import NodeStatus
+from pycrorm_async.imports.intake import IntakeEpisode
+
+END, OTHER, START, INSTANT, EMPTY_END = range(5)
+"""The order at one time: a node ends before its successor starts, and one of no duration ends after its start."""
+
+Other: TypeAlias = tuple[int, Callable[[int], object]]
+"""A time in ns since 1970, and a function that gives something of that time to the episode."""
+
+
+@dataclass(slots=True)
+class Span:
+    """A node of a file that says when it began and ended.
+
+    Attributes:
+        key: names it in its episode.
+        start, end: in ns since 1970; without an end it ends UNKNOWN with its episode.
+        parent: the key of the node it is inside; the root takes the place of one that is not in the file.
+        failure: reason and message.
+        instants: observations of it: time, name, values.
+    """
+
+    key: Hashable
+    dtype: str
+    parameters: Mapping[str, Any]
+    start: int
+    end: int | None
+    parent: Hashable | None = None
+    kind: Literal["action", "motion", "language"] = "action"
+    status: NodeStatus | Literal["UNKNOWN"] = "UNKNOWN"
+    failure: tuple[str, str] | None = None
+    result: Any = None
+    instants: Sequence[tuple[int, str, object]] = ()
+
+
+def nest(spans: Iterable[Span]) -> None:
+    """Give each span the innermost one that is open when it starts as its parent, as on one track of a trace."""
+    stack: list[Span] = []
+    for span in sorted(spans, key=lambda each: (each.start, -_end_of(each))):
+        while stack and _end_of(stack[-1]) <= span.start:
+            stack.pop()
+        span.parent = stack[-1].key if stack else None
+        stack.append(span)
+
+
+def _end_of(span: Span) -> int:
+    return 2**63 if span.end is None else span.end
+
+
+def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[Other] = ()) -> None:
+    """Give a tree of spans to an episode, and what else happened, in the order of time.
+
+    A span whose clock was behind that of its parent starts after it, at its own time.
+    """
+    places = _places(spans)
+    steps: list[tuple[int, int, int, int, Any]] = [
+        (each[0], OTHER, 0, index, each) for index, each in enumerate(others)
+    ]
+    for index, span in enumerate(spans):
+        begin, depth = places[span.key]
+        steps.append((begin, START, depth, index, span))
+        steps += [(max(each[0], begin), INSTANT, depth, index, (span, each)) for each in span.instants]
+        if span.end is not None:
+            phase = END if span.end > begin else EMPTY_END
+            steps.append((max(span.end, begin), phase, -depth, index, span))
+    for _at, phase, _depth, _index, what in sorted(steps, key=lambda each: each[:4]):
+        if phase == OTHER:
+            at, give = what
+            give(at)
+        elif phase == START:
+            parent = what.parent if what.parent in places else None
+            episode.start(what.key, what.kind, what.dtype, what.parameters, what.start, parent=parent)
+        elif phase == INSTANT:
+            span, (at, name, values) = what
+            episode.observe(name, values, at, node=span.key)
+        else:
+            episode.end(what.key, what.status, what.end, failure=what.failure, result=what.result)
+
+
+def _places(spans: Sequence[Span]) -> dict[Hashable, tuple[int, int]]:
+    """Return by key when each span starts, at the earliest with its parent, and how deep it is.
+
+    A span that is its own ancestor loses its parent.
+    """
+    by_key = {each.key: each for each in spans}
+    places: dict[Hashable, tuple[int, int]] = {}
+    for span in spans:
+        path: dict[Hashable, Span] = {}
+        above: Span | None = span
+        while above is not None and above.key not in places:
+            if above.key in path:
+                next(reversed(path.values())).parent = None
+                above = None
+                break
+            path[above.key] = above
+            above = by_key.get(above.parent) if above.parent is not None else None
+        begin, depth = places[above.key] if above is not None else (-(2**63), -1)
+        for each in reversed(path.values()):
+            begin, depth = max(begin, each.start), depth + 1
+            places[each.key] = begin, depth
+    return places
