@@ -17,22 +17,13 @@ from typing import Any
 
 from sqlalchemy import select
 
+from pycrorm_async import plan
 from pycrorm_async.cli.output import JsonOption, note, print_json, print_table, stdout
 from pycrorm_async.cli.reading import DEFAULT_URL, Place
 from pycrorm_async.cli.show import print_tree
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, ProcessMetaData
 from pycrorm_async.orm import Pose as PoseRow
-from pycrorm_async.plan import (
-    ActionAbstract,
-    CostmapLocation,
-    MoveTorsoAction,
-    ObjectDesignatorDescription,
-    ParkArmsAction,
-    ParkArmsActionPerformable,
-    SemanticCostmapLocation,
-    simulated_robot,
-)
 from pycrorm_async.plan import NavigateAction as Navigate
 from pycrorm_async.plan import PickUpAction as PickUp
 from pycrorm_async.plan import PlaceAction as PutDown
@@ -52,24 +43,24 @@ def kitchen_world() -> None:
 
 async def breakfast() -> None:
     """Bring the cereal from the counter to the kitchen island."""
-    cereal = ObjectDesignatorDescription(names=["cereal"])
-    kitchen = ObjectDesignatorDescription(names=["kitchen"]).resolve()
-    robot = ObjectDesignatorDescription(names=["pr2"]).resolve()
-    with simulated_robot:
-        await ParkArmsActionPerformable(Arms.BOTH).perform()
-        await MoveTorsoAction([0.3]).resolve().perform()
+    cereal = plan.ObjectDesignatorDescription(names=["cereal"])
+    kitchen = plan.ObjectDesignatorDescription(names=["kitchen"]).resolve()
+    robot = plan.ObjectDesignatorDescription(names=["pr2"]).resolve()
+    with plan.simulated_robot:
+        await plan.ParkArmsActionPerformable(Arms.BOTH).perform()
+        await plan.MoveTorsoAction([0.3]).resolve().perform()
 
-        base_pose = CostmapLocation(target=cereal.resolve(), reachable_for=robot).resolve()
+        base_pose = plan.CostmapLocation(target=cereal.resolve(), reachable_for=robot).resolve()
         arm = base_pose.reachable_arms[0]
         await Navigate([base_pose.pose]).resolve().perform()
         await PickUp(cereal, [arm], [Grasp.FRONT]).resolve().perform()
-        await ParkArmsAction([Arms.BOTH]).resolve().perform()
+        await plan.ParkArmsAction([Arms.BOTH]).resolve().perform()
 
-        place = SemanticCostmapLocation("kitchen_island_surface", kitchen, cereal.resolve()).resolve()
-        base_pose = CostmapLocation(place.pose, reachable_for=robot, reachable_arm=arm).resolve()
+        place = plan.SemanticCostmapLocation("kitchen_island_surface", kitchen, cereal.resolve()).resolve()
+        base_pose = plan.CostmapLocation(place.pose, reachable_for=robot, reachable_arm=arm).resolve()
         await Navigate([base_pose.pose]).resolve().perform()
         await PutDown(cereal, [place.pose], [arm]).resolve().perform()
-        await ParkArmsActionPerformable(Arms.BOTH).perform()
+        await plan.ParkArmsActionPerformable(Arms.BOTH).perform()
 
 
 def demo(place: Place, as_json: JsonOption = False) -> None:
@@ -126,7 +117,7 @@ async def _run_and_query(url: str, spool: Path | None) -> Answers:
 
         # A dataclass is enough to define a new action.
         @dataclass
-        class SayingActionPerformable(ActionAbstract):
+        class SayingActionPerformable(plan.ActionAbstract):
             text: str
 
             async def perform(self) -> None:

@@ -10,15 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    Chosen,
-    Form,
-    moment,
-    note,
-    print_json,
-    print_table,
-    stdout,
-)
+from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.show import simulated_by
 from pycrorm_async.query.named_queries import EpisodeSummary
@@ -39,9 +31,9 @@ def episodes(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Also list simulated episodes (SimulatedTaskTree).")
     ] = False,
-    chosen: Chosen,
+    chosen: output.Chosen,
     every: Annotated[bool, typer.Option("--all", help=f"All of them, instead of the newest {_LISTED}.")] = False,
-    form: Form,
+    form: output.Form,
 ) -> None:
     """List the newest 50 of the recorded episodes, the oldest of them first, and say how many there are."""
     choice = chosen.choice(None if every else _LISTED)
@@ -55,22 +47,22 @@ def episodes(
 
     summaries, total, absence = place.read(read)
     if form.as_json:
-        print_json(summaries)
+        output.print_json(summaries)
     if total > len(summaries):
-        note(f"the newest {len(summaries)} of {total:,} episodes; --all lists all, --limit N the newest N")
+        output.note(f"the newest {len(summaries)} of {total:,} episodes; --all lists all, --limit N the newest N")
     if form.as_json:
         return
     if not summaries:
-        note(absence)
+        output.note(absence)
         if form.is_table:
             return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
     rows: list[tuple[object, ...]] = [
-        (e.number, moment(e.started_at), _took(e, form), e.status_text, e.nodes, e.failed, text)
+        (e.number, output.moment(e.started_at), _took(e, form), e.status_text, e.nodes, e.failed, text)
         for e, text in ((each, _description(each, numbers)) for each in summaries)
     ]
-    if stdout.width >= _WIDTH_WITH_ROBOTS and any(each.robots for each in summaries):
+    if output.stdout.width >= _WIDTH_WITH_ROBOTS and any(each.robots for each in summaries):
         columns = (*columns, "robots")
         names = (", ".join(robot.name for robot in each.robots) for each in summaries)
         rows = [(*row, name) for row, name in zip(rows, names, strict=True)]
@@ -80,10 +72,10 @@ def episodes(
     if simulated:
         columns = (*columns, "simulated")
         rows = [(*row, simulated_by(e) if e.simulated else "") for row, e in zip(rows, summaries, strict=True)]
-    print_table(f"Episodes of {place.address}", columns, rows, as_csv=form.as_csv)
+    output.print_table(f"Episodes of {place.address}", columns, rows, as_csv=form.as_csv)
 
 
-def _took(episode: EpisodeSummary, form: Form) -> object:
+def _took(episode: EpisodeSummary, form: output.Form) -> object:
     """Return the duration: of CSV in s, for programs."""
     if form.is_table or episode.duration_ns is None:
         return duration(episode.duration_ns)

@@ -13,18 +13,8 @@ from typing import Annotated, Any
 
 import typer
 
+from pycrorm_async.cli import output
 from pycrorm_async.cli.interruption import interrupt_on_termination
-from pycrorm_async.cli.output import (
-    JsonOption,
-    StatusOption,
-    TagOption,
-    counted,
-    note,
-    parse_since,
-    print_json,
-    print_line,
-    problem,
-)
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import ExportComparison, Exported, export_again, format_named, format_of
@@ -41,7 +31,7 @@ _READ: Mapping[Any, Callable[[str], Any]] = {
     bool: lambda text: {"true": True, "false": False}[text.lower()],
     int: int,
     float: float,
-    datetime: parse_since,
+    datetime: output.parse_since,
 }
 """Functions that read the text of an argument, by its type. An argument of another type stays a text."""
 
@@ -64,8 +54,8 @@ def export(
         list[str] | None,
         typer.Option("--episode", metavar="EPISODE", help="Of a view or a question: only this episode; repeatable."),
     ] = None,
-    status: StatusOption = None,
-    tag: TagOption = None,
+    status: output.StatusOption = None,
+    tag: output.TagOption = None,
     without_tag: Annotated[
         list[str] | None, typer.Option("--without-tag", metavar="TAG", help="No episodes with this tag; repeatable.")
     ] = None,
@@ -94,7 +84,7 @@ def export(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the file and its manifest if they exist.")] = False,
     place: Place,
-    as_json: JsonOption = False,
+    as_json: output.JsonOption = False,
 ) -> int:
     """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again.
 
@@ -140,7 +130,7 @@ def export(
     place.note_pending_events()
     _print(exported, as_json=as_json)
     for number, reason in exported.unreadable.items():
-        problem(f"episode {number} is not in it: {reason}")
+        output.problem(f"episode {number} is not in it: {reason}")
     return 1 if exported.unreadable else 0
 
 
@@ -188,12 +178,12 @@ def _again(manifest: Path, out: Path | None, place: Place, *, force: bool, as_js
     if as_json:
         file = comparison.exported and out
         outcome = {"same": comparison.same, "by_bytes": comparison.by_bytes, "differences": comparison.differences}
-        print_json({**outcome, "file": file})
+        output.print_json({**outcome, "file": file})
     else:
         same = "the same bytes" if comparison.by_bytes else "the same episode and changes; rerun gives random ids"
-        print_line(same if comparison.same else "not the same")
+        output.print_line(same if comparison.same else "not the same")
         for each in comparison.differences:
-            print_line(f"  {each}")
+            output.print_line(f"  {each}")
     return 0 if comparison.same else 1
 
 
@@ -202,13 +192,13 @@ def _print(exported: Exported, *, as_json: bool) -> None:
     if as_json:
         counts: dict[str, Any] = {"rows": exported.rows, "episodes": exported.episodes, "left_out": exported.left_out}
         counts |= {"unreadable": exported.unreadable} if exported.unreadable else {}
-        print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
+        output.print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return
-    print_line(exported.path)
+    output.print_line(exported.path)
     noun = format_named(manifest.file_format).noun
-    content = f"{counted(exported.rows, noun)} of {counted(exported.episodes, 'episode')}"
-    note(f"It has {content}; {exported.path}.manifest.json describes it.")
+    content = f"{output.counted(exported.rows, noun)} of {output.counted(exported.episodes, 'episode')}"
+    output.note(f"It has {content}; {exported.path}.manifest.json describes it.")
     if exported.unknown_name:
-        note(f"no row answers; {exported.unknown_name}")
+        output.note(f"no row answers; {exported.unknown_name}")
     if exported.left_out:
-        note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")
+        output.note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")

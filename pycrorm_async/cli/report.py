@@ -10,15 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    Chosen,
-    JsonOption,
-    counted,
-    note,
-    print_json,
-    print_line,
-    problem,
-)
+from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
@@ -34,7 +26,7 @@ def report(
     every: Annotated[
         bool, typer.Option("--all", help="Write a table of the episodes, and pages of the newest 200 behind it.")
     ] = False,
-    chosen: Chosen,
+    chosen: output.Chosen,
     plot: Annotated[
         list[str] | None,
         typer.Option(
@@ -56,7 +48,7 @@ def report(
         int | None, typer.Option("--to", min=1, metavar="SEQUENCE", help="Show events up to this one.")
     ] = None,
     place: Place,
-    as_json: JsonOption = False,
+    as_json: output.JsonOption = False,
 ) -> int:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures.
 
@@ -94,13 +86,13 @@ def _write_overview(
     written = place.read(lambda reading: overview(reading, out, choice=choice, plots=plots, force=force))
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
-        print_json({"file": written.path, **counts, "unreadable": written.unreadable})
+        output.print_json({"file": written.path, **counts, "unreadable": written.unreadable})
     else:
-        print_line(written.path)
-        episodes = counted(written.episodes, "episode")
-        note(f"It has {episodes}; pages of {written.pages} are in {out.stem}.pages beside it.")
+        output.print_line(written.path)
+        episodes = output.counted(written.episodes, "episode")
+        output.note(f"It has {episodes}; pages of {written.pages} are in {out.stem}.pages beside it.")
     for number, reason in written.unreadable.items():
-        problem(f"episode {number} has no page: {reason}")
+        output.problem(f"episode {number} has no page: {reason}")
     return 1 if written.unreadable else 0
 
 
@@ -118,12 +110,12 @@ def _write_episode(
     size = written.path.stat().st_size
     if as_json:
         shown = {"first": written.first, "last": written.last, "events": written.events}
-        print_json({"file": written.path, "bytes": size, **shown})
+        output.print_json({"file": written.path, "bytes": size, **shown})
         return
-    print_line(written.path)
-    note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
+    output.print_line(written.path)
+    output.note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
     if written.last < min(last or written.events, written.events):  # it ends before the last event asked for
-        note(
+        output.note(
             f"It shows the events {written.first} to {written.last} of {written.events}, because a page holds no more;"
             f" the next page: --from {written.last + 1}"
         )

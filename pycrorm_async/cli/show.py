@@ -17,15 +17,8 @@ from pycrorm_async.cli.output import EpisodeArgument, JsonOption, moment, print_
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import BLOB_KEY
-from pycrorm_async.query.named_queries import (
-    EpisodeSummary,
-    NodeSummary,
-    Percept,
-    PlaceSearch,
-    counts_text,
-    percepts_of,
-    searches_of,
-)
+from pycrorm_async.query import named_queries
+from pycrorm_async.query.named_queries import Percept, PlaceSearch
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen, parse_moment
 from pycrorm_async.query.text import duration, one_line, parameters_text
@@ -68,14 +61,18 @@ def show(
 
 
 def _show(episode: str, place: Place, *, events: bool, full: bool, as_json: bool) -> None:
-    async def query(reading: Reading) -> tuple[EpisodeSummary, list[NodeSummary], _Answers]:
+    async def query(reading: Reading) -> tuple[named_queries.EpisodeSummary, list[named_queries.NodeSummary], _Answers]:
         summary = await reading.episode(episode)
         tree = await reading.tree(summary)
         if not (full or as_json):
             return summary, tree, ((), ())
         async with reading.session(simulated=True) as session:
             number = summary.number
-            return summary, tree, (await percepts_of(session, number), await searches_of(session, number))
+            return (
+                summary,
+                tree,
+                (await named_queries.percepts_of(session, number), await named_queries.searches_of(session, number)),
+            )
 
     summary, tree, (percepts, places) = place.read(query)
     if as_json:
@@ -104,7 +101,7 @@ def _show(episode: str, place: Place, *, events: bool, full: bool, as_json: bool
     print_places(places)
 
 
-def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]:
+def _provenance(summary: named_queries.EpisodeSummary, *, full: bool) -> dict[str, str | None]:
     """Return the plan, commit, world, settings and clock of the recording; None for each that is unknown."""
     digits_max = None if full else _DIGITS_MAX
     commit, source, clock = summary.git_commit, summary.plan_sha256, summary.clock_synchronized
@@ -285,7 +282,7 @@ _SIMULATIONS_MAX = 10
 _STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
 
 
-def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool = False) -> None:
+def print_tree(nodes: Sequence[named_queries.NodeSummary], *, events: bool = False, full: bool = False) -> None:
     """Print the nodes of one episode as a tree; `nodes` lists each parent before its children.
 
     With `events` each line has the events of the node's start and end. Long texts are cut and end in an ellipsis,
@@ -297,7 +294,7 @@ def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool
 
 
 def tree_of(
-    nodes: Iterable[NodeSummary], *, events: bool = False, full: bool = False, no_wrap: bool = False
+    nodes: Iterable[named_queries.NodeSummary], *, events: bool = False, full: bool = False, no_wrap: bool = False
 ) -> Tree | None:
     """Return the tree that `print_tree` prints; None without nodes. With `no_wrap` each node takes one line."""
     drawn: dict[int, Tree] = {}
@@ -314,7 +311,7 @@ def tree_of(
     return root
 
 
-def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
+def _line(node: named_queries.NodeSummary, *, events: bool, full: bool) -> Text:
     line = Text(visible(node.dtype or node.kind))
     if node.parameters:
         line.append(f"  {visible(parameters_text(node.parameters, full=full, exact=full))}", style="dim")
@@ -325,7 +322,7 @@ def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
         line.append(f"  e{node.sequence}-{end}", style="dim")
     if node.observations:
         line.append(f"  {node.observations} observation{'s' * (node.observations > 1)}", style="dim")
-    if counts := counts_text(node):
+    if counts := named_queries.counts_text(node):
         line.append(f"  {counts}", style="dim")
     if node.reason:
         message = one_line(node.failure_message or "", None if full else _MESSAGE_MAX)
@@ -338,7 +335,7 @@ def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
     return line
 
 
-def simulated_by(episode: EpisodeSummary) -> str:
+def simulated_by(episode: named_queries.EpisodeSummary) -> str:
     """Describe the node that ran a simulated episode, for example `by PickUpAction of episode 3`."""
     by = episode.thought_by
     if by is None:

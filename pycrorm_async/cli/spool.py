@@ -14,35 +14,15 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    FileAccessOption,
-    JsonOption,
-    ProjectionOption,
-    moment,
-    note,
-    print_facts,
-    print_json,
-    print_line,
-    print_table,
-    problem,
-)
+from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
 from pycrorm_async.operations.recovery import Rebinding
 from pycrorm_async.projections.custom import load_projections
+from pycrorm_async.queue import maintenance
 from pycrorm_async.queue.locks import REFUSED
-from pycrorm_async.queue.maintenance import (
-    FileDamage,
-    Range,
-    RecorderReport,
-    RepairReport,
-    SpoolReport,
-    finish_repairs,
-    inspect_spool,
-    repair_folder,
-)
 from pycrorm_async.queue.spool import folder_error
 from pycrorm_async.settings import Settings
 
@@ -51,25 +31,25 @@ FolderArgument = Annotated[
 ]
 
 
-def inspect(*, folder: FolderArgument = None, place: Place, as_json: JsonOption = False) -> int:
+def inspect(*, folder: FolderArgument = None, place: Place, as_json: output.JsonOption = False) -> int:
     """List the contents of a spool, reading only its files. Changes nothing.
 
     Exit code 4 if a file is damaged, 3 if a folder cannot be read, 1 if the spool contains files of other programs.
     """
     spool = _spool_folder(folder, place)
-    report = inspect_spool(spool)
+    report = maintenance.inspect_spool(spool)
     if as_json:
-        print_json(_document(report))
+        output.print_json(_document(report))
     else:
         _print(report)
     for each in report.recorders:
         if each.damage is not None:
             remedy = "stop its process first" if each.alive else f"repair it with: pycrorm spool repair {spool}"
-            problem(f"{_damage_text(each.damage)}; {remedy}")
+            output.problem(f"{_damage_text(each.damage)}; {remedy}")
         if each.refused is not None:
-            problem(each.refused)
+            output.problem(each.refused)
     for name in report.strangers:
-        problem(f"{spool / name} does not belong to a spool and is ignored")
+        output.problem(f"{spool / name} does not belong to a spool and is ignored")
     if any(each.damage for each in report.recorders):
         return 4
     if any(each.refused for each in report.recorders):
@@ -77,39 +57,39 @@ def inspect(*, folder: FolderArgument = None, place: Place, as_json: JsonOption 
     return 1 if report.strangers or any(each.foreign for each in report.recorders) else 0
 
 
-def repair(*, folder: FolderArgument = None, place: Place, as_json: JsonOption = False) -> int:
+def repair(*, folder: FolderArgument = None, place: Place, as_json: output.JsonOption = False) -> int:
     """Repair damaged folders of dead recorders, so that their readable records can be stored.
 
     The original of a repaired folder is kept beside it under the name that is printed. Exit code 1 if records could
     not be kept, 3 if a damaged folder cannot be repaired.
     """
     spool = _spool_folder(folder, place)
-    inspect_spool(spool)
-    finished = finish_repairs(spool)
-    repaired: list[RepairReport] = []
+    maintenance.inspect_spool(spool)
+    finished = maintenance.finish_repairs(spool)
+    repaired: list[maintenance.RepairReport] = []
     refused: dict[str, PycrormError] = {}
-    for each in inspect_spool(spool).recorders:
+    for each in maintenance.inspect_spool(spool).recorders:
         if each.damage is None and each.refused is None:
             continue
         try:
-            report = repair_folder(Path(each.path))
+            report = maintenance.repair_folder(Path(each.path))
         except Exception as fault:  # noqa: BLE001 - reported for this folder; the others can still be repaired
             refused[each.name] = folder_error(Path(each.path), fault)
         else:
             repaired += [report] if report is not None else []
     if as_json:
-        print_json(_repair_document(finished, repaired, refused))
+        output.print_json(_repair_document(finished, repaired, refused))
     else:
         for path in finished:
-            print_line(f"{path.name}: completed an interrupted repair")
+            output.print_line(f"{path.name}: completed an interrupted repair")
         for report in repaired:
             _print_repair(report)
         if not (finished or repaired or refused):
-            print_line("nothing is damaged")
+            output.print_line("nothing is damaged")
     for error in refused.values():
-        problem(str(error))
+        output.problem(str(error))
     if repaired and not as_json:
-        note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {spool}")
+        output.note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {spool}")
     if refused:
         return 3
     return 0 if all(each.complete for each in repaired) else 1
@@ -121,9 +101,9 @@ def _spool_folder(folder: Path | None, place: Place) -> Path:
 
 def rebind(
     place: Place,
-    projection: ProjectionOption = None,
-    file_access: FileAccessOption = "owner",
-    as_json: JsonOption = False,
+    projection: output.ProjectionOption = None,
+    file_access: output.FileAccessOption = "owner",
+    as_json: output.JsonOption = False,
 ) -> int:
     """Bind a spool to the database at the URL, after its own database was deleted or replaced, and store its events.
 
@@ -141,11 +121,11 @@ def rebind(
 def _print_rebinding(planned: Rebinding) -> None:
     before = f"log {planned.before}" if planned.before else "no log"
     events = f"{planned.events} events of {planned.recorders} recorder{'' if planned.recorders == 1 else 's'}"
-    note(f"binding {planned.spool} to log {planned.after} (before: {before}) and storing its {events} there")
+    output.note(f"binding {planned.spool} to log {planned.after} (before: {before}) and storing its {events} there")
 
 
-def _print(report: SpoolReport) -> None:
-    print_facts(
+def _print(report: maintenance.SpoolReport) -> None:
+    output.print_facts(
         f"Spool {report.path}",
         {
             "log": report.log_id or "none: no writer has drained the spool yet",
@@ -155,7 +135,7 @@ def _print(report: SpoolReport) -> None:
         },
     )
     if report.recorders:
-        print_table(
+        output.print_table(
             "Recorders",
             ("recorder", "state", "files", "first", "last", "synced", "records", "episodes", "open", "torn bytes"),
             [
@@ -178,8 +158,8 @@ def _print(report: SpoolReport) -> None:
         _print_recorder(each)
 
 
-def _print_recorder(each: RecorderReport) -> None:
-    print_facts(
+def _print_recorder(each: maintenance.RecorderReport) -> None:
+    output.print_facts(
         each.name,
         {
             "types": ", ".join(f"{name} {count}" for name, count in each.types.items()),
@@ -189,45 +169,45 @@ def _print_recorder(each: RecorderReport) -> None:
         },
     )
     for one in each.open:
-        print_line(f"  open: episode {one.id}, {one.sequence} events, the last at {_time(one.wall_ns)}")
+        output.print_line(f"  open: episode {one.id}, {one.sequence} events, the last at {_time(one.wall_ns)}")
 
 
-def _print_repair(report: RepairReport) -> None:
-    print_line(
+def _print_repair(report: maintenance.RepairReport) -> None:
+    output.print_line(
         f"{report.name}: repaired; {report.kept} records before the damage are kept,"
         f" {report.saved} behind it are salvaged"
     )
-    print_line(f"  original folder: {report.set_aside}")
-    print_line(f"  damage: {_damage_text(report.damage)}")
+    output.print_line(f"  original folder: {report.set_aside}")
+    output.print_line(f"  damage: {_damage_text(report.damage)}")
     if report.unreadable:
-        print_line(f"  not kept: {_spans('position', report.unreadable)}, because the bytes cannot be read")
+        output.print_line(f"  not kept: {_spans('position', report.unreadable)}, because the bytes cannot be read")
     for each in report.given_up:
         kept = f"kept up to event {each.kept_to}" if each.kept_to else "not kept at all"
-        print_line(
+        output.print_line(
             f"  not kept: {_spans('event', each.sequences)} of episode {each.episode}, because the events before them"
             f" are missing ({_spans('position', each.positions)} in the original folder); the episode is {kept}"
         )
     if report.headless:
-        print_line("  not kept: the ends of episodes that were open in the oldest file and have no later record")
+        output.print_line("  not kept: the ends of episodes that were open in the oldest file and have no later record")
 
 
-def _state(each: RecorderReport) -> str:
+def _state(each: maintenance.RecorderReport) -> str:
     state = "refused" if each.name.endswith(REFUSED) else "alive" if each.alive else "dead"
     return f"{state}, being drained" if each.being_drained else state
 
 
-def _damage_text(damage: FileDamage) -> str:
+def _damage_text(damage: maintenance.FileDamage) -> str:
     return f"{damage.file} is damaged at byte {damage.offset}: {damage.reason}"
 
 
 def _time(wall_ns: int) -> str:
     try:
-        return f"{moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
+        return f"{output.moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
     except (ValueError, OverflowError, OSError):  # the recording machine's clock was not set
         return f"{wall_ns} ns"
 
 
-def _spans(noun: str, ranges: Sequence[Range]) -> str:
+def _spans(noun: str, ranges: Sequence[maintenance.Range]) -> str:
     """Format ranges of numbers behind their noun.
 
     >>> _spans("event", [(5, 5)]), _spans("event", [(5, 7), (9, 9)])
@@ -238,7 +218,7 @@ def _spans(noun: str, ranges: Sequence[Range]) -> str:
     return f"{noun}{'s' * is_plural} {', '.join(texts)}"
 
 
-def _document(report: SpoolReport) -> dict[str, object]:
+def _document(report: maintenance.SpoolReport) -> dict[str, object]:
     recorders = [asdict(each) | {"records": each.records} for each in report.recorders]
     for each in recorders:  # `pycrorm status` shows these
         del each["bytes_spooled"], each["recorded"], each["drained"]
@@ -246,7 +226,7 @@ def _document(report: SpoolReport) -> dict[str, object]:
 
 
 def _repair_document(
-    finished: Sequence[Path], repaired: Sequence[RepairReport], refused: dict[str, PycrormError]
+    finished: Sequence[Path], repaired: Sequence[maintenance.RepairReport], refused: dict[str, PycrormError]
 ) -> dict[str, object]:
     return {
         "mended": [asdict(each) | {"complete": each.complete} for each in repaired],

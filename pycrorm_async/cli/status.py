@@ -18,17 +18,9 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError, DatabaseForeign
 from pycrorm_async.operations.workers import DaemonNote, FoldWorkerState
+from pycrorm_async.projections import generations
 from pycrorm_async.projections.custom import ProjectionState, installed_projections, states
-from pycrorm_async.projections.generations import (
-    PROJECTION,
-    PROJECTION_VERSION,
-    SHOWN,
-    contradictions,
-    current_generation,
-    failed_views,
-    read_generation,
-    unmade_types,
-)
+from pycrorm_async.projections.generations import failed_views
 from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
 from pycrorm_async.queue.maintenance import inspect_recorder
 from pycrorm_async.queue.spool import RecorderFolder, Spool, wrap_os_errors
@@ -363,8 +355,13 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
             running,
             running_total,
             await states(log, installed_projections(())),
-            [*outdated, *await log.limits_near(), *await _left_out_of_recall(log), *await contradictions(log)],
-            await unmade_types(log),
+            [
+                *outdated,
+                *await log.limits_near(),
+                *await _left_out_of_recall(log),
+                *await generations.contradictions(log),
+            ],
+            await generations.unmade_types(log),
             await failed_views(log),
             await log.stored_on(),
             await log.incarnations(),
@@ -378,7 +375,7 @@ async def _outdated(log: EventLog) -> list[str]:
     """Return a line if the tables are those of another version."""
     try:
         async with log.reading() as connection:
-            await current_generation(connection)
+            await generations.current_generation(connection)
     except DatabaseForeign as fault:
         heads = [each.head for each in await log.episodes()]
         return [
@@ -390,7 +387,7 @@ async def _outdated(log: EventLog) -> list[str]:
 async def _left_out_of_recall(log: EventLog) -> list[str]:
     """Return a line for each feature that recall does not compare."""
     async with log.snapshot() as connection:
-        generation = await read_generation(connection, f"{PROJECTION}{CaseProjection.name}")
+        generation = await generations.read_generation(connection, f"{generations.PROJECTION}{CaseProjection.name}")
         if generation is None or generation.version != CaseProjection.version:
             return []
         features = await read_left_out(connection, generation.number)
@@ -400,8 +397,8 @@ async def _left_out_of_recall(log: EventLog) -> list[str]:
 async def _running(log: EventLog) -> tuple[list[RunningEpisode], int]:
     """Query the running episodes; none where this version cannot read the tables."""
     async with log.snapshot() as connection:
-        generation = await read_generation(connection, SHOWN)
-        if generation is None or generation.version != PROJECTION_VERSION:
+        generation = await generations.read_generation(connection, generations.SHOWN)
+        if generation is None or generation.version != generations.PROJECTION_VERSION:
             return [], 0
         return await running_episodes(connection, RUNNING_MAX)
 

@@ -18,16 +18,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.output import (
-    FileAccessOption,
-    JsonOption,
-    ProjectionOption,
-    counted,
-    note,
-    print_json,
-    problem,
-    stdout,
-)
+from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
@@ -48,12 +39,12 @@ def writer(
         bool, typer.Option("--once", help="Recover, append and fold all events present now, then exit.")
     ] = False,
     place: Place,
-    projection: ProjectionOption = None,
-    file_access: FileAccessOption = "owner",
+    projection: output.ProjectionOption = None,
+    file_access: output.FileAccessOption = "owner",
     recall: Annotated[
         bool, typer.Option("--recall/--no-recall", help="Make the cases that `pycrorm recall` compares.")
     ] = True,
-    as_json: JsonOption = False,
+    as_json: output.JsonOption = False,
 ) -> int:
     """Drain a spool continuously: append its events to the database and fold them into the tables.
 
@@ -72,9 +63,10 @@ def writer(
     with forked(WORKERS, place.url) as processes:
         summary = asyncio.run(_serve_until_signal(place, projections, settings, processes))
     if as_json:
-        print_json(summary._asdict())
+        output.print_json(summary._asdict())
     else:
-        note(f"stopped after {counted(summary.records, 'event')} of {counted(summary.recorders, 'recorder')}")
+        events, recorders = output.counted(summary.records, "event"), output.counted(summary.recorders, "recorder")
+        output.note(f"stopped after {events} of {recorders}")
     return 0
 
 
@@ -100,7 +92,7 @@ async def _serve_until_signal(
         place.url,
         spool=place.spool,
         stop=stop,
-        report=note,
+        report=output.note,
         settings=settings,
         projections=projections,
         fold_workers=WORKERS,
@@ -125,21 +117,21 @@ def store_once(
     with stderr.status("recovering the events of dead processes …"):
         report = asyncio.run(recover(place.url, spool=place.spool, settings=settings, projections=projections))
     if as_json:
-        print_json({**extra, **_document(report)})
+        output.print_json({**extra, **_document(report)})
     else:
         _print(report)
     if report.drained.pending is not None:
-        note(f"the tables do not show what is stored: {report.drained.pending}")
+        output.note(f"the tables do not show what is stored: {report.drained.pending}")
     for name, error in report.failed.items():
         remedy = ""
         if isinstance(error, SpoolDamaged):
             remedy = f"; repair it with: pycrorm spool repair {error.path.parent.parent}"
-        problem(f"{name}: {error}{remedy}")
+        output.problem(f"{name}: {error}{remedy}")
     for episode, reason in report.drained.stopped.items():
-        problem(f"episode {episode} is stopped: {reason}{_dead_letters_text(report.dead_letters.get(episode))}")
+        output.problem(f"episode {episode} is stopped: {reason}{_dead_letters_text(report.dead_letters.get(episode))}")
     for episode, folder in report.dead_letters.items():
         if episode not in report.drained.stopped:
-            problem(f"episode {episode} was refused{_dead_letters_text(folder)}")
+            output.problem(f"episode {episode} was refused{_dead_letters_text(folder)}")
     if any(isinstance(error, DamageError) for error in report.failed.values()):
         return 4
     if report.failed:
@@ -156,12 +148,12 @@ def _print(report: RecoveryReport) -> None:
     events = sum(each.records for each in drained)
     dead = len(drained) - report.living
     living = f"{report.living} living, " if report.living else ""
-    stdout.print(
+    output.stdout.print(
         f"{dead} dead recorder{'' if dead == 1 else 's'}, {living}{events} events stored,"
         f" {report.drained.folded} folded, {len(report.lost)} episode{'' if len(report.lost) == 1 else 's'} LOST"
     )
     for episode in report.lost:
-        stdout.print(f"  LOST {episode}")
+        output.stdout.print(f"  LOST {episode}")
 
 
 def _document(report: RecoveryReport) -> dict[str, object]:

@@ -21,24 +21,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    EpisodeTagged,
-    Happening,
-    JointsMoved,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectDetected,
-    ObjectMoved,
-    ObjectRemoved,
-    Observed,
-    StateSampled,
-)
+from pycrorm_async.events import types as event_types
 
 _NODE, _OBJECT = 1, 2
 
@@ -70,49 +53,49 @@ class OrderCheck:
         self._kinds = bytearray()
         """One byte for each sequence: `_NODE` or `_OBJECT` if that event created one, else 0."""
 
-    def read(self, sequence: int, event: Happening) -> list[Finding]:
+    def read(self, sequence: int, event: event_types.Happening) -> list[Finding]:
         """Read the next event and return its findings, damage before remarks; empty if the event is in order."""
         findings: list[Finding] = []
         if sequence != self._last + 1:
             findings.append(Finding("damage", sequence, _gap(self._last, sequence)))
         self._last = sequence
-        if isinstance(event, EpisodeStarted):
+        if isinstance(event, event_types.EpisodeStarted):
             if self._state != "before":
                 findings.append(Finding("damage", sequence, "the episode starts a second time"))
             self._state = "open"
             return findings
         if self._state == "before":
             findings.append(Finding("damage", sequence, "the episode has not started"))
-        elif self._state == "closed" and not isinstance(event, EpisodeTagged):
+        elif self._state == "closed" and not isinstance(event, event_types.EpisodeTagged):
             findings.append(Finding("damage", sequence, "the episode has ended already"))
         findings += [Finding(kind, sequence, text) for kind, text in self._faults(sequence, event)]
         return findings
 
-    def _faults(self, sequence: int, event: Happening) -> list[tuple[Literal["damage", "remark"], str]]:
+    def _faults(self, sequence: int, event: event_types.Happening) -> list[tuple[Literal["damage", "remark"], str]]:
         match event:
-            case NodeStarted():
+            case event_types.NodeStarted():
                 return self._start(sequence, event)
-            case NodeEnded():
+            case event_types.NodeEnded():
                 return self._end(event)
-            case EpisodeEnded():
+            case event_types.EpisodeEnded():
                 self._state = "closed"
                 if self._parents and event.status != "LOST":
                     return [("remark", f"{len(self._parents)} nodes are open at the end")]
-            case ObjectAdded():
+            case event_types.ObjectAdded():
                 self._set_kind(sequence, _OBJECT)
-            case ObjectMoved():
+            case event_types.ObjectMoved():
                 return self._unknown_objects(event.object)
-            case ObjectRemoved() | JointsMoved():
+            case event_types.ObjectRemoved() | event_types.JointsMoved():
                 return self._unknown_objects(event.object.object)
-            case ObjectAttached() | ObjectDetached():
+            case event_types.ObjectAttached() | event_types.ObjectDetached():
                 return self._unknown_objects(event.parent.object, event.child.object)
-            case StateSampled():
+            case event_types.StateSampled():
                 return [*self._unknown_objects(event.object.object), *self._unknown_node(event.node)]
-            case LocationResolved() | ObjectDetected() | Observed():
+            case event_types.LocationResolved() | event_types.ObjectDetected() | event_types.Observed():
                 return self._unknown_node(event.node)
         return []
 
-    def _start(self, sequence: int, event: NodeStarted) -> list[tuple[Literal["damage", "remark"], str]]:
+    def _start(self, sequence: int, event: event_types.NodeStarted) -> list[tuple[Literal["damage", "remark"], str]]:
         parent_started = event.parent is None or self._is(event.parent, _NODE)
         is_second_root = event.parent is None and self._any_node
         parent_open = event.parent is None or event.parent in self._parents
@@ -125,7 +108,7 @@ class OrderCheck:
             return [("damage", "a second node without a parent")]
         return [] if parent_open else [("remark", f"its parent {event.parent} had ended")]
 
-    def _end(self, event: NodeEnded) -> list[tuple[Literal["damage", "remark"], str]]:
+    def _end(self, event: event_types.NodeEnded) -> list[tuple[Literal["damage", "remark"], str]]:
         if not self._is(event.node, _NODE):
             return [("damage", f"node {event.node} ends and never started")]
         if event.node not in self._parents:

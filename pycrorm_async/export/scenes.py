@@ -16,16 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import description_of
-from pycrorm_async.events.types import (
-    Happening,
-    JointsMoved,
-    ObjectAdded,
-    ObjectMoved,
-    ObjectRemoved,
-    PoseValue,
-    StateSampled,
-)
 from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.query.reading import Reading
@@ -82,20 +74,20 @@ class ExportedEpisode(EpisodeReplay):
         self.changes: list[Change] = []
         self._poses: dict[int, tuple[float, ...]] = {}
 
-    def read(self, event: StoredEvent) -> Happening | None:
+    def read(self, event: StoredEvent) -> event_types.Happening | None:
         """Apply the next event, as `EpisodeReplay.read`, and keep its change of the world."""
         happening = super().read(event)
         self.events.append(self.at)
         match happening:
-            case ObjectAdded():
+            case event_types.ObjectAdded():
                 self._change(event.sequence, _numbers(happening.pose), happening.joints)
-            case ObjectMoved():
+            case event_types.ObjectMoved():
                 self._change(happening.object, _numbers(happening.pose))
-            case JointsMoved():
+            case event_types.JointsMoved():
                 self._change(happening.object.object, joints=happening.joints)
-            case StateSampled():
+            case event_types.StateSampled():
                 self._sampled(happening.object.object, happening.channels)
-            case ObjectRemoved():
+            case event_types.ObjectRemoved():
                 self._change(happening.object.object, removed=True)
         return happening
 
@@ -145,7 +137,7 @@ class ExportedEpisode(EpisodeReplay):
         return sorted(lines, key=lambda each: each.when.sequence)
 
 
-def _numbers(pose: PoseValue) -> tuple[float, ...]:
+def _numbers(pose: event_types.PoseValue) -> tuple[float, ...]:
     return (*pose.position, *pose.orientation)
 
 

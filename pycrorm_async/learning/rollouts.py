@@ -40,21 +40,13 @@ from pycrorm_async.learning.policy import (
 )
 from pycrorm_async.learning.recorded_policy import keep_policy
 from pycrorm_async.orm import BatchRolloutAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
+from pycrorm_async.plan import objects
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.geometry import lifting_arms
 from pycrorm_async.plan.language import ActionAbstract, ActionDescription
 from pycrorm_async.plan.locations import BaseClearance, base_clearance, base_height_m, face
 from pycrorm_async.plan.motions import simulated_robot_within
-from pycrorm_async.plan.objects import (
-    CurrentRobot,
-    ObjectDesignatorDescription,
-    ObjectLike,
-    designator_of,
-    in_world,
-    require_robot,
-    require_world,
-)
 from pycrorm_async.plan.task import Experience, PastSuccess, experience
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.query.success import interval_95
@@ -86,7 +78,7 @@ _VISIBLE_SHARE_MIN = 0.5
 """The least share of the object that must be visible from a place."""
 
 
-def free_and_visible(robot: CurrentRobot, target: Object) -> Region:
+def free_and_visible(robot: objects.CurrentRobot, target: Object) -> Region:
     """Return the places where the robot's base is clear of obstacles and its camera sees the object. Moves nothing.
 
     Where collisions count, the base is clear of the places outside with any heading; `MoveAndPickUp` checks the heading
@@ -180,7 +172,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     def __init__(
         self,
-        target: ObjectLike | ObjectDesignatorDescription,
+        target: objects.ObjectLike | objects.ObjectDesignatorDescription,
         arms: Iterable[Arms] | None = None,
         grasps: Iterable[Grasp] | None = None,
         policy: Policy | None = None,
@@ -191,7 +183,11 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         super().__init__(MoveAndPickUpPerformable)
         if samples < 1:
             raise CallerError(f"samples must be >= 1, got {samples}")
-        self.target = target.resolve() if isinstance(target, ObjectDesignatorDescription) else designator_of(target)
+        self.target = (
+            target.resolve()
+            if isinstance(target, objects.ObjectDesignatorDescription)
+            else objects.designator_of(target)
+        )
         self.allowed = evidence = Evidence(
             arms=frozenset(arms) if arms is not None else None,
             grasps=frozenset(grasps) if grasps is not None else None,
@@ -227,7 +223,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     @property
     def height(self) -> float:
         """Height of the object over the lifted torso at this moment, m. Raises `NoWorld`, `NoRobotHere`."""
-        robot = require_robot()
+        robot = objects.require_robot()
         torso = robot.body.joint_position(robot.torso_joint())
         return self.target.pose.position.z - robot.body.pose.position.z - torso
 
@@ -243,7 +239,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
         Raises `ObjectUnreachable` if that has probability 0.
         """
-        region = free_and_visible(require_robot(), in_world(self.target))
+        region = free_and_visible(objects.require_robot(), objects.in_world(self.target))
         return self._condition(
             Evidence(self._strong_enough(), region=region, height=_around(self.height)), "in this scene"
         )
@@ -251,7 +247,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def _strong_enough(self) -> frozenset[Arms] | None:
         """Return the allowed arms that lift the object; None if that does not rule one out."""
         allowed = ARMS if self.allowed.arms is None else tuple(self.allowed.arms)
-        lifting = lifting_arms(require_robot(), allowed, self.target)
+        lifting = lifting_arms(objects.require_robot(), allowed, self.target)
         return frozenset(lifting) if len(lifting) < len(allowed) else None
 
     def _condition(self, evidence: Evidence, where: str) -> Policy:
@@ -385,7 +381,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
 
     def __init__(
         self,
-        target: ObjectLike | ObjectDesignatorDescription,
+        target: objects.ObjectLike | objects.ObjectDesignatorDescription,
         arms: Iterable[Arms] | None = None,
         grasps: Iterable[Grasp] | None = None,
         policy: Policy | None = None,
@@ -423,7 +419,10 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         """Yield the way with the highest expected success that was not yielded yet, then the policy's samples."""
         source = self._experience if self._experience is not None else experience.get()
         if source is not None:
-            region, clearance = free_and_visible(require_robot(), in_world(self.target)), base_clearance()
+            region, clearance = (
+                free_and_visible(objects.require_robot(), objects.in_world(self.target)),
+                base_clearance(),
+            )
             tried: set[PickUpChoice] = set()
             while (best := await self._best(source, region, clearance, tried)) is not None:
                 choice, way = best
@@ -443,7 +442,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]
     ) -> tuple[PickUpChoice, PastSuccess] | None:
         """Return the best way that is left and possible here."""
-        robot = require_robot()
+        robot = objects.require_robot()
         torso = robot.body.joint_position(robot.torso_joint()) if robot.description.torso_joint is not None else None
         over_base = self.target.pose.position.z - robot.body.pose.position.z
         arms = lifting_arms(robot, self._arms, self.target)
@@ -647,7 +646,7 @@ async def batch_rollout(
         raise CallerError(f"count, first and seed of rollouts must be >= 0, got {count}, {first} and {seed}")
     tally = Tally()
     with _bar(count) if report_progress is None else nullcontext(report_progress) as report:
-        run = _Run(action, action.policy_here(), reset or require_world().reset, stop, tally, report)
+        run = _Run(action, action.policy_here(), reset or objects.require_world().reset, stop, tally, report)
         slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
         for begin, length in slices:
             if stop():

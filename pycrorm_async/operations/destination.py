@@ -28,16 +28,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Final, NamedTuple
 
+from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import (
-    CallerError,
-    DatabaseError,
-    FilesError,
-    LogDamaged,
-    LogWentBack,
-    SpoolDamaged,
-    TablesForeign,
-)
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.projections.custom import Projection, installed_projections
@@ -94,7 +86,7 @@ class LogAndTables:
         """Open the tables. Raises as `Projector.open` does, except `TablesForeign`: each fold then opens them again."""
         try:
             await self._projector.open()
-        except TablesForeign as error:
+        except errors.TablesForeign as error:
             self._refused = True
             _log.warning("%s; events are stored in the log but not folded until then", error)
 
@@ -111,7 +103,7 @@ class LogAndTables:
                 heads = self._heads or {}
                 try:
                     stored = await self.log.store(records, witness=next(reversed(heads.items()), None))
-                except LogWentBack:
+                except errors.LogWentBack:
                     await self.confirm()
                     continue
                 if all(row.head >= heads.get(each, 0) for each, row in stored.rows.items()):
@@ -132,20 +124,20 @@ class LogAndTables:
             if heads is None:
                 try:
                     heads = await asyncio.to_thread(stored_heads, self._spool, self.log_id)
-                except (OSError, FilesError) as error:  # must not stop the drain
+                except (OSError, errors.FilesError) as error:  # must not stop the drain
                     _log.warning("%s: cannot compare with the kept segments: %s", self.log.address, error)
                     heads = {}
             rows = await self.log.heads(list(heads))
             now = {each: rows[each].head if each in rows else 0 for each in heads}
             lost = next((each for each, head in heads.items() if now[each] < head), None)
             if lost is not None:
-                await self._heal(LogWentBack(episode_text(lost), heads[lost], now[lost]), self._spool, heads)
+                await self._heal(errors.LogWentBack(episode_text(lost), heads[lost], now[lost]), self._spool, heads)
                 # What no segment contains is not searched again.
                 self._heads = {each: row.head for each, row in (await self.log.heads(list(_latest(heads)))).items()}
             elif self._heads is None:
                 self._heads = _latest(heads)
 
-    async def _heal(self, cause: LogWentBack, spool: Path, confirmed: Mapping[EpisodeId, int]) -> None:
+    async def _heal(self, cause: errors.LogWentBack, spool: Path, confirmed: Mapping[EpisodeId, int]) -> None:
         """Append again what the segments contain, and fold it, because a flush waits for new events only.
 
         Events of a recorder's own folder that were not stored before are appended with the others, and not counted. In
@@ -178,7 +170,7 @@ class LogAndTables:
                             heads[each] = row.head
                             if is_lost and (each not in rows or rows[each]._replace(folded=0, parked=None) != row):
                                 changed[each] = row
-            except LogDamaged as error:  # skip this recorder; the segments of the others may still heal the log
+            except errors.LogDamaged as error:  # skip this recorder; the segments of the others may still heal the log
                 _log.error("recorder %s: %s", recorder.name, error)
         if self._heads is None and not changed:
             return
@@ -190,7 +182,7 @@ class LogAndTables:
         for work in (partial(self.log.note_incarnation, *noticed), self.fold):
             try:
                 await work()
-            except DatabaseError as error:
+            except errors.DatabaseError as error:
                 _log.warning("%s: the healing is not noted or not visible yet: %s", self.log.address, error)
 
     @property
@@ -304,7 +296,7 @@ def shared_address(url: str | DatabaseAddress) -> DatabaseAddress:
     """The address of a database that another process can open too. Raises `UnknownUrl`, `CallerError`."""
     address = DatabaseAddress.parse(url) if isinstance(url, str) else url
     if address.is_private:
-        raise CallerError("sqlite:// exists only in its own process, no other can open it: name a file")
+        raise errors.CallerError("sqlite:// exists only in its own process, no other can open it: name a file")
     return address
 
 
@@ -363,7 +355,7 @@ def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
             yield ready[:count]
             del ready[:count]
             yielded += count
-    except (FileNotFoundError, SpoolDamaged, FilesError):
+    except (FileNotFoundError, errors.SpoolDamaged, errors.FilesError):
         return
 
 
@@ -380,7 +372,7 @@ def stored_heads(spool: Path, log_id: str) -> dict[EpisodeId, int]:
         newest[each.path.parent] = each.path
     for folder, path in list(newest.items())[-_RECORDERS_MAX:]:
         if folder.parent == stored_in(spool, log_id) and is_folder_name(folder.name):
-            with suppress(FileNotFoundError, SpoolDamaged), map_segment(path) as buffer:
+            with suppress(FileNotFoundError, errors.SpoolDamaged), map_segment(path) as buffer:
                 last = last_event(buffer, salt_of(parse_folder_name(folder.name).recorder, int(path.stem)))
                 if last is not None:
                     heads[EpisodeId(last.episode)] = last.sequence

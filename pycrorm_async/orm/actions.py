@@ -16,19 +16,8 @@ from __future__ import annotations
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, synonym
 
+from pycrorm_async.orm import rows as row_classes
 from pycrorm_async.orm.episodes import Pose
-from pycrorm_async.orm.rows import (
-    Action,
-    Language,
-    Motion,
-    Object,
-    ObjectDesignatorParameter,
-    ObjectParameter,
-    ObjectPartParameter,
-    PoseParameter,
-    TargetLocationParameter,
-    TargetParameter,
-)
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
 __all__ = [
@@ -72,98 +61,98 @@ __all__ = [
 ]
 
 
-class NavigateAction(TargetLocationParameter, Action):
+class NavigateAction(row_classes.TargetLocationParameter, row_classes.Action):
     """Drive to a place."""
 
 
-class ParkArmsAction(Action):
+class ParkArmsAction(row_classes.Action):
     """Fold an arm, or both, out of the way."""
 
     arm: Mapped[Arms]
 
 
-class MoveTorsoAction(Action):
+class MoveTorsoAction(row_classes.Action):
     """Lift or lower the torso to `position` (m)."""
 
     position: Mapped[float]
 
 
-class SetGripperAction(Action):
+class SetGripperAction(row_classes.Action):
     """Open or close a gripper."""
 
     gripper: Mapped[Arms]
     motion: Mapped[GripperState]
 
 
-class ReleaseAction(ObjectDesignatorParameter, Action):
+class ReleaseAction(row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Release an object."""
 
     gripper: Mapped[Arms] = mapped_column(sort_order=-1)
 
 
-class GripAction(ObjectDesignatorParameter, Action):
+class GripAction(row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Hold an object with `effort` (N)."""
 
     gripper: Mapped[Arms] = mapped_column(sort_order=-1)
     effort: Mapped[float]
 
 
-class PickUpAction(ObjectDesignatorParameter, Action):
+class PickUpAction(row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Grasp an object and lift it; `object` is its row from before the action."""
 
     arm: Mapped[Arms]
     grasp: Mapped[Grasp]
 
 
-class PlaceAction(ObjectDesignatorParameter, TargetLocationParameter, Action):
+class PlaceAction(row_classes.ObjectDesignatorParameter, row_classes.TargetLocationParameter, row_classes.Action):
     """Place a grasped object at a pose."""
 
     arm: Mapped[Arms]
 
 
-class TransportAction(ObjectDesignatorParameter, TargetLocationParameter, Action):
+class TransportAction(row_classes.ObjectDesignatorParameter, row_classes.TargetLocationParameter, row_classes.Action):
     """Fetch an object and bring it to a place."""
 
     arm: Mapped[Arms]
 
 
-class LookAtAction(TargetParameter, Action):
+class LookAtAction(row_classes.TargetParameter, row_classes.Action):
     """Turn the head to a point."""
 
 
-class DetectAction(ObjectDesignatorParameter, Action):
+class DetectAction(row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Look for an object."""
 
 
-class OpenAction(ObjectDesignatorParameter, Action):
+class OpenAction(row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Open the container that `object`, a handle, belongs to."""
 
     arm: Mapped[Arms]
 
 
-class CloseAction(ObjectDesignatorParameter, Action):
+class CloseAction(row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Close the container that `object`, a handle, belongs to."""
 
     arm: Mapped[Arms]
 
 
-class GraspingAction(ObjectParameter, Action):
+class GraspingAction(row_classes.ObjectParameter, row_classes.Action):
     """Grasp a handle."""
 
     arm: Mapped[Arms]
 
     object_id: Mapped[int] = mapped_column("object_desig_id", ForeignKey("object.id"))
     object_desig_id: Mapped[int] = synonym("object_id")
-    object_desig: Mapped[Object] = synonym("object")
+    object_desig: Mapped[row_classes.Object] = synonym("object")
 
 
-class FaceAtAction(PoseParameter, Action):
+class FaceAtAction(row_classes.PoseParameter, row_classes.Action):
     """Turn the base and the head to a point."""
 
     pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
 
 
-class MoveAndPickUpAction(PoseParameter, ObjectDesignatorParameter, Action):
+class MoveAndPickUpAction(row_classes.PoseParameter, row_classes.ObjectDesignatorParameter, row_classes.Action):
     """Drive to a place, face the object and pick it up.
 
     Attributes:
@@ -179,7 +168,7 @@ class MoveAndPickUpAction(PoseParameter, ObjectDesignatorParameter, Action):
     standing_position: Mapped[Pose] = synonym("pose")
 
 
-class BatchRolloutAction(Action):
+class BatchRolloutAction(row_classes.Action):
     """Try one action many times, each chosen by a policy (`pycrorm_async.learning.batch_rollout`).
 
     Attributes:
@@ -206,7 +195,7 @@ class BatchRolloutAction(Action):
         return self.entries("grasps")
 
 
-class LearnPolicyAction(Action):
+class LearnPolicyAction(row_classes.Action):
     """A policy was learned (`pycrorm_async.learning.record_policy`); `read_policy` returns it by its name.
 
     Attributes:
@@ -239,29 +228,29 @@ class LearnPolicyAction(Action):
 # === language =================================================================================================
 
 
-class Sequential(Language):
+class Sequential(row_classes.Language):
     """Performs its operands in order, up to the first that fails."""
 
 
-class TryInOrder(Language):
+class TryInOrder(row_classes.Language):
     """Performs its operands in order, up to the first that succeeds."""
 
 
-class Parallel(Language):
+class Parallel(row_classes.Language):
     """Performs its operands concurrently; succeeds if all do."""
 
 
-class TryAll(Language):
+class TryAll(row_classes.Language):
     """Performs its operands concurrently; succeeds if one does."""
 
 
-class Repeat(Language):
+class Repeat(row_classes.Language):
     """Performs its operand `times` times."""
 
     times: Mapped[int]
 
 
-class Monitor(Language):
+class Monitor(row_classes.Language):
     """Performs its operand until that ends or a condition holds; in the latter case its node becomes INTERRUPTED.
 
     Attributes:
@@ -273,7 +262,7 @@ class Monitor(Language):
     interval_s: Mapped[float]
 
 
-class Code(Language):
+class Code(row_classes.Language):
     """Calls a function.
 
     Attributes:
@@ -288,7 +277,7 @@ class Code(Language):
         return self.mapping("arguments")
 
 
-class Retry(Language):
+class Retry(row_classes.Language):
     """Repeats its operand, or its next alternative, until one succeeds, at most `max_tries` times."""
 
     max_tries: Mapped[int]
@@ -301,22 +290,22 @@ class Retry(Language):
 # The joints of `MoveArmJointsMotion` and `MoveJointsMotion` are rows of `parameter_item`.
 
 
-class MoveMotion(TargetParameter, Motion):
+class MoveMotion(row_classes.TargetParameter, row_classes.Motion):
     """Drive the base to a pose."""
 
 
-class MoveTCPMotion(TargetParameter, Motion):
+class MoveTCPMotion(row_classes.TargetParameter, row_classes.Motion):
     """Bring the tool frame of one arm to a pose."""
 
     arm: Mapped[Arms]
     allow_gripper_collision: Mapped[bool | None]
 
 
-class LookingMotion(TargetParameter, Motion):
+class LookingMotion(row_classes.TargetParameter, row_classes.Motion):
     """Turn the head to a point."""
 
 
-class MoveGripperMotion(Motion):
+class MoveGripperMotion(row_classes.Motion):
     """Open or close a gripper."""
 
     motion: Mapped[GripperState]
@@ -324,7 +313,7 @@ class MoveGripperMotion(Motion):
     allow_gripper_collision: Mapped[bool | None]
 
 
-class MoveArmJointsMotion(Motion):
+class MoveArmJointsMotion(row_classes.Motion):
     """Move arm joints to positions (rad), by name."""
 
     @property
@@ -338,7 +327,7 @@ class MoveArmJointsMotion(Motion):
         return self.mapping("right_arm_poses")
 
 
-class MoveJointsMotion(Motion):
+class MoveJointsMotion(row_classes.Motion):
     """Move joints to positions (rad or m)."""
 
     @property
@@ -352,31 +341,31 @@ class MoveJointsMotion(Motion):
         return self.entries("positions")
 
 
-class DetectingMotion(Motion):
+class DetectingMotion(row_classes.Motion):
     """Look for objects of a type."""
 
     object_type: Mapped[ObjectType]
 
 
-class OpeningMotion(ObjectPartParameter, Motion):
+class OpeningMotion(row_classes.ObjectPartParameter, row_classes.Motion):
     """Move an arm so that the container whose handle it grasps opens."""
 
     arm: Mapped[Arms]
 
 
-class ClosingMotion(ObjectPartParameter, Motion):
+class ClosingMotion(row_classes.ObjectPartParameter, row_classes.Motion):
     """Move an arm so that the container whose handle it grasps closes."""
 
     arm: Mapped[Arms]
 
 
-class WorldStateDetectingMotion(Motion):
+class WorldStateDetectingMotion(row_classes.Motion):
     """Read objects of a type from the state of the world instead of a camera."""
 
     object_type: Mapped[ObjectType]
 
 
-class AccessingMotion(ObjectParameter, Motion):
+class AccessingMotion(row_classes.ObjectParameter, row_classes.Motion):
     """Open or close a drawer by its handle."""
 
     arm: Mapped[Arms]
@@ -387,4 +376,4 @@ class AccessingMotion(ObjectParameter, Motion):
 
     object_id: Mapped[int] = mapped_column("part_of_id", ForeignKey("object.id"), sort_order=-1)
     part_of_id: Mapped[int] = synonym("object_id")
-    part_of: Mapped[Object] = synonym("object")
+    part_of: Mapped[row_classes.Object] = synonym("object")

@@ -21,21 +21,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, dataclass_transform
 
 import msgspec
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    ColumnElement,
-    Dialect,
-    Double,
-    String,
-    Text,
-    and_,
-    bindparam,
-    event,
-    inspect,
-    literal_column,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.ext.hybrid import hybrid_property
@@ -86,19 +72,19 @@ def _decoded(text: str | None) -> Any:
 class Moment(TypeDecorator[datetime]):
     """An aware datetime, exact to the microsecond and read in UTC. A naive one is refused: it names no time zone."""
 
-    impl = BigInteger
+    impl = sa.BigInteger
     cache_ok = True
     storage = "time"
     """The storage of its columns (`projections.schema`)."""
 
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> int | None:  # noqa: ARG002
+    def process_bind_param(self, value: datetime | None, dialect: sa.Dialect) -> int | None:  # noqa: ARG002
         if value is None:
             return None
         if value.tzinfo is None:
             raise ValueError(f"{value!r} has no time zone: write datetime(..., tzinfo=UTC)")
         return (value - _EPOCH) // _MICROSECOND
 
-    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[int | None], datetime | None]:  # noqa: ARG002
+    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[int | None], datetime | None]:  # noqa: ARG002
         return _moment
 
 
@@ -109,7 +95,7 @@ class EnumName(TypeDecorator[Any]):
     would turn the members of an `IntEnum` into their numbers. Objects have members on every connection (`orm.base`).
     """
 
-    impl = String
+    impl = sa.String
     cache_ok = True
 
     def __init__(self, enum: type[Enum]) -> None:
@@ -117,10 +103,10 @@ class EnumName(TypeDecorator[Any]):
         self.enum = enum
         self._members = _Members(enum)
 
-    def process_bind_param(self, value: Enum | str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
+    def process_bind_param(self, value: Enum | str | None, dialect: sa.Dialect) -> str | None:  # noqa: ARG002
         return value.name if isinstance(value, Enum) else value
 
-    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any] | None:  # noqa: ARG002
+    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[str | None], Any] | None:  # noqa: ARG002
         return self._members.__getitem__ if dialect.is_async else None
 
     def member(self, name: str) -> Enum | str:
@@ -145,13 +131,13 @@ class _Members(dict[str | None, Any]):
 class JsonText(TypeDecorator[Any]):
     """A value stored as JSON text; None is NULL."""
 
-    impl = Text
+    impl = sa.Text
     cache_ok = True
 
-    def process_bind_param(self, value: Any, dialect: Dialect) -> str | None:  # noqa: ARG002
+    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> str | None:  # noqa: ARG002
         return None if value is None else msgspec.json.encode(value).decode()
 
-    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any]:  # noqa: ARG002
+    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[str | None], Any]:  # noqa: ARG002
         return _decoded
 
 
@@ -186,7 +172,7 @@ def one_of(reference: Callable[[], Any], table: str, class_: Any = None, **optio
     def joined() -> Any:
         attribute = reference()
         others, own_episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
-        return and_(foreign(attribute) == remote(others.id), own_episode == remote(others.process_metadata_id))
+        return sa.and_(foreign(attribute) == remote(others.id), own_episode == remote(others.process_metadata_id))
 
     return _by_id(relationship(class_, primaryjoin=joined, viewonly=True, **options))
 
@@ -197,7 +183,7 @@ def many_of(reference: Callable[[], Any], table: str, **options: Any) -> Any:
     def joined() -> Any:
         attribute = reference()
         own, episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
-        return and_(own.id == remote(foreign(attribute)), own.process_metadata_id == remote(episode))
+        return sa.and_(own.id == remote(foreign(attribute)), own.process_metadata_id == remote(episode))
 
     return _by_id(relationship(primaryjoin=joined, viewonly=True, **options))
 
@@ -210,7 +196,7 @@ def inherited_from(base: Any, table: Any) -> dict[str, Any]:
 
 def same_row(one: Any, other: Any) -> Any:
     """Return the condition that rows of two tables have the same id and episode."""
-    return and_(one.c.id == other.c.id, one.c[EPISODE] == other.c[EPISODE])
+    return sa.and_(one.c.id == other.c.id, one.c[EPISODE] == other.c[EPISODE])
 
 
 def _by_id(related: Any) -> Any:
@@ -232,11 +218,11 @@ class EnumOfObject(EnumName):
 
     cache_ok = True
 
-    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any] | None:
+    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[str | None], Any] | None:
         """Listen to loads from the first result of a synchronous connection on, because listening costs a load 8 %."""
-        if not dialect.is_async and not event.contains(Base, "load", _read_members):
+        if not dialect.is_async and not sa.event.contains(Base, "load", _read_members):
             for loaded in ("load", "refresh"):
-                event.listen(Base, loaded, _read_members, raw=True, propagate=True)
+                sa.event.listen(Base, loaded, _read_members, raw=True, propagate=True)
         return super().result_processor(dialect, coltype)
 
 
@@ -266,16 +252,16 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
     """Columns of the table that the view leaves out, with their `info` (`COMPUTED`)."""
 
     type_annotation_map: ClassVar[dict[Any, Any]] = {
-        int: BigInteger(),
-        float: Double(),
-        str: Text(),
-        bool: Boolean(),
+        int: sa.BigInteger(),
+        float: sa.Double(),
+        str: sa.Text(),
+        bool: sa.Boolean(),
         datetime: Moment(),
         **{enum: EnumOfObject(enum) for enum in (Arms, Grasp, GripperState, ObjectType, TaskStatus)},
     }
 
     def __repr__(self) -> str:
-        mapper = inspect(self).mapper
+        mapper = sa.inspect(self).mapper
         names = [
             *(each.key for each in mapper.column_attrs if not each.key.startswith("_") and not _is_deferred(each)),
             *(["robot_state"] if "robot_state" in mapper.relationships else []),
@@ -313,14 +299,14 @@ class RowOfEvent:
 
     @sequence.inplace.expression
     @classmethod
-    def _sequence_of_class(cls) -> ColumnElement[int]:
+    def _sequence_of_class(cls) -> sa.ColumnElement[int]:
         # Literals, because PostgreSQL shifts by a 4-byte integer only and a parameter would be of 8 bytes.
-        row: ColumnElement[int] = getattr(cls, cls._row)
-        shifted = row.bitwise_rshift(literal_column(str(SLOT_MAX.bit_length())))
-        return shifted.bitwise_and(literal_column(str(SEQUENCE_MAX)))
+        row: sa.ColumnElement[int] = getattr(cls, cls._row)
+        shifted = row.bitwise_rshift(sa.literal_column(str(SLOT_MAX.bit_length())))
+        return shifted.bitwise_and(sa.literal_column(str(SEQUENCE_MAX)))
 
 
-@event.listens_for(Base, "mapper_configured", propagate=True)
+@sa.event.listens_for(Base, "mapper_configured", propagate=True)
 def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:
     """Let columns of subclasses be loaded in batches, guard attributes on request, and note the enum columns."""
     if mapper.inherits is not None:
@@ -347,7 +333,7 @@ def require_loaded(row: Base, name: str, requested_by: Base | None = None, reque
     if session is not None and (in_greenlet() or not session.get_bind().dialect.is_async):
         return
     named, attribute = requested_by or row, request or name.removeprefix("_")
-    state, class_ = inspect(named), type(named).__name__
+    state, class_ = sa.inspect(named), type(named).__name__
     columns = state.mapper.column_attrs
     key, option = state.identity, "undefer" if {attribute, f"_{attribute}"} & {*columns.keys()} else "selectinload"
     raise CallerError(
@@ -463,7 +449,7 @@ def _peers(session: Session, state: InstanceState[Any], class_: type, *names: st
 def _load(session: Session, class_: Any, states: list[InstanceState[Any]], *options: Any) -> None:
     rows = [each.obj() for each in states]  # so that no row is collected, and made again, during the load
     keys = sorted({each.identity[0] for each in states if each.identity})
-    statement = select(class_).where(_key(class_).in_(bindparam(KEYS, expanding=True))).options(*options)
+    statement = sa.select(class_).where(_key(class_).in_(sa.bindparam(KEYS, expanding=True))).options(*options)
     session.execute(statement, {KEYS: keys}).unique().all()
     del rows
 
@@ -515,7 +501,7 @@ class KnownClasses:
         self._identities.clear()
 
 
-def known_classes(dialect: Dialect) -> KnownClasses:
+def known_classes(dialect: sa.Dialect) -> KnownClasses:
     """Return the `KnownClasses` of the engine that this dialect belongs to, which owns them."""
     classes: KnownClasses = vars(dialect).setdefault("pycrorm_known_classes", KnownClasses())
     return classes

@@ -25,19 +25,7 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any, ClassVar
 
-from sqlalchemy import (
-    BigInteger,
-    Column,
-    ColumnElement,
-    Dialect,
-    ForeignKey,
-    FromClause,
-    String,
-    Table,
-    and_,
-    or_,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
@@ -45,21 +33,7 @@ from sqlalchemy.types import TypeDecorator
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.types import BoxValue, DescriptionDeclared, MeshValue
-from pycrorm_async.orm.base import (
-    COMPUTED,
-    EPISODE,
-    ON_REQUEST,
-    Base,
-    HybridOf,
-    JsonText,
-    RowOfEvent,
-    inherited_from,
-    is_built_in,
-    known_classes,
-    many_of,
-    one_of,
-    require_loaded,
-)
+from pycrorm_async.orm import base as orm_base
 from pycrorm_async.orm.episodes import Pose, ProcessMetaData, RobotState
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
@@ -101,7 +75,7 @@ __all__ = [
 # object share `identity_id`.
 
 
-class Concept(Base):
+class Concept(orm_base.Base):
     """A class of the ontology (SOMA, DUL) and one of its superclasses: several rows if it has several.
 
     Attributes:
@@ -116,7 +90,7 @@ class Concept(Base):
     source: Mapped[str]
 
 
-class ConceptAncestor(Base):
+class ConceptAncestor(orm_base.Base):
     """A pair of a concept and one of its superclasses, however far up, or itself."""
 
     __tablename__ = "concept_ancestor"
@@ -125,13 +99,13 @@ class ConceptAncestor(Base):
     ancestor: Mapped[str] = mapped_column(primary_key=True)
 
 
-def is_concept(column: ColumnElement[Any], concept: str) -> ColumnElement[bool]:
+def is_concept(column: sa.ColumnElement[Any], concept: str) -> sa.ColumnElement[bool]:
     """Return the condition that a column names this concept or one of its subclasses."""
-    below = select(ConceptAncestor.concept).where(ConceptAncestor.ancestor == concept)
-    return or_(column == concept, column.in_(below))
+    below = sa.select(ConceptAncestor.concept).where(ConceptAncestor.ancestor == concept)
+    return sa.or_(column == concept, column.in_(below))
 
 
-class ObjectConcept(Base):
+class ObjectConcept(orm_base.Base):
     """The SOMA concept of an object type, such as `MilkPack` of `MILK`."""
 
     __tablename__ = "object_concept"
@@ -140,7 +114,7 @@ class ObjectConcept(Base):
     concept: Mapped[str]
 
 
-class ObjectDescription(Base):
+class ObjectDescription(orm_base.Base):
     """A description that objects were made from.
 
     Attributes:
@@ -187,7 +161,7 @@ class ObjectDescription(Base):
         return self.declared.missing
 
 
-class Object(RowOfEvent, Base):
+class Object(orm_base.RowOfEvent, orm_base.Base):
     """An object of the world at a moment.
 
     Attributes:
@@ -210,58 +184,60 @@ class Object(RowOfEvent, Base):
     __tablename__ = "object"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     dtype: Mapped[str]
     name: Mapped[str]
     obj_type: Mapped[ObjectType | None] = mapped_column(index=True)
-    pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
-    identity_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"), index=True)
+    pose_id: Mapped[int | None] = mapped_column(sa.ForeignKey("pose.id"))
+    identity_id: Mapped[int | None] = mapped_column(sa.ForeignKey("object.id"), index=True)
     time: Mapped[datetime]
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
-    joints: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
-    description_fingerprint: Mapped[str | None] = mapped_column(ForeignKey("object_description.fingerprint"))
-    color: Mapped[list[float] | None] = mapped_column(JsonText())
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"))
+    joints: Mapped[dict[str, Any] | None] = mapped_column(orm_base.JsonText())
+    description_fingerprint: Mapped[str | None] = mapped_column(sa.ForeignKey("object_description.fingerprint"))
+    color: Mapped[list[float] | None] = mapped_column(orm_base.JsonText())
     model: Mapped[str | None]
     serial: Mapped[str | None]
     mass_kg: Mapped[float | None]
     base_link: Mapped[str | None]
 
-    pose: Mapped[Pose | None] = one_of(lambda: Object.pose_id, "pose")
+    pose: Mapped[Pose | None] = orm_base.one_of(lambda: Object.pose_id, "pose")
     description: Mapped[ObjectDescription | None] = relationship(
         secondary=lambda: _ADDED,
-        primaryjoin=lambda: and_(
+        primaryjoin=lambda: sa.and_(
             Object.identity_id == _ADDED.c.id, Object.process_metadata_id == _ADDED.c.process_metadata_id
         ),
         secondaryjoin=lambda: _ADDED.c.description_fingerprint == ObjectDescription.fingerprint,
         viewonly=True,
         uselist=False,
-        info=ON_REQUEST,
+        info=orm_base.ON_REQUEST,
     )
-    node: Mapped[TaskTreeNode | None] = one_of(lambda: Object.node_id, "task_tree_node", info=ON_REQUEST)
+    node: Mapped[TaskTreeNode | None] = orm_base.one_of(
+        lambda: Object.node_id, "task_tree_node", info=orm_base.ON_REQUEST
+    )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
 
     @classmethod
-    def is_a(cls, concept: str) -> ColumnElement[bool]:
+    def is_a(cls, concept: str) -> sa.ColumnElement[bool]:
         """Return the condition that the SOMA concept of its type is this one or a subclass of it.
 
         >>> tableware = select(Object).where(Object.is_a("Tableware"))
         """
-        types = select(ObjectConcept.obj_type).where(is_concept(ObjectConcept.__table__.c.concept, concept))
+        types = sa.select(ObjectConcept.obj_type).where(is_concept(ObjectConcept.__table__.c.concept, concept))
         return cls.obj_type.in_(types)
 
 
-_ADDED: FromClause = Object.__table__.alias("added")
+_ADDED: sa.FromClause = Object.__table__.alias("added")
 """The rows of objects from when they were added, which name the descriptions."""
 
 
 class ObjectPart(Object):
     """A link of an object as an action's parameter; `part_of` is the object it belongs to."""
 
-    part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"), info={"after": "pose_id"})
+    part_of_id: Mapped[int | None] = mapped_column(sa.ForeignKey("object.id"), info={"after": "pose_id"})
 
-    part_of: Mapped[Object | None] = one_of(lambda: ObjectPart.part_of_id, "object")
+    part_of: Mapped[Object | None] = orm_base.one_of(lambda: ObjectPart.part_of_id, "object")
 
     __mapper_args__ = {"polymorphic_identity": "ObjectPart", "polymorphic_load": "inline"}  # noqa: RUF012
 
@@ -269,9 +245,9 @@ class ObjectPart(Object):
 class LocatedObject(Object):
     """An object located relative to another one, `reference`; `pose` is its pose in the map."""
 
-    reference_id: Mapped[int | None] = mapped_column("part_of_id", ForeignKey("object.id"), use_existing_column=True)
+    reference_id: Mapped[int | None] = mapped_column("part_of_id", sa.ForeignKey("object.id"), use_existing_column=True)
 
-    reference: Mapped[Object | None] = one_of(lambda: LocatedObject.reference_id, "object")
+    reference: Mapped[Object | None] = orm_base.one_of(lambda: LocatedObject.reference_id, "object")
 
     __mapper_args__ = {"polymorphic_identity": "LocatedObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
@@ -282,62 +258,62 @@ class BelieveObject(Object):
     __mapper_args__ = {"polymorphic_identity": "BelieveObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
 
-class ObjectRemoval(RowOfEvent, Base):
+class ObjectRemoval(orm_base.RowOfEvent, orm_base.Base):
     """The removal of an object from the world."""
 
     __tablename__ = "object_removal"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
-    identity_id: Mapped[int] = mapped_column(ForeignKey("object.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    object_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"))
+    identity_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"), index=True)
     time: Mapped[datetime]
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"))
 
-    object: Mapped[Object] = one_of(lambda: ObjectRemoval.object_id, "object")
+    object: Mapped[Object] = orm_base.one_of(lambda: ObjectRemoval.object_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
-class Attachment(RowOfEvent, Base):
+class Attachment(orm_base.RowOfEvent, orm_base.Base):
     """A change at `time`: `child` begins to move with `link` of `parent` (`kind` attached), or stops (detached)."""
 
     __tablename__ = "attachment"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     kind: Mapped[str]
-    parent_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
-    child_id: Mapped[int] = mapped_column(ForeignKey("object.id"), index=True)
+    parent_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"))
+    child_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"), index=True)
     link: Mapped[str | None]
     time: Mapped[datetime]
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"))
 
-    parent: Mapped[Object] = one_of(lambda: Attachment.parent_id, "object")
-    child: Mapped[Object] = one_of(lambda: Attachment.child_id, "object")
+    parent: Mapped[Object] = orm_base.one_of(lambda: Attachment.parent_id, "object")
+    child: Mapped[Object] = orm_base.one_of(lambda: Attachment.child_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
-class JointChange(RowOfEvent, Base):
+class JointChange(orm_base.RowOfEvent, orm_base.Base):
     """A new position (rad or m) of an object's joint. Rows of one motion share their `id`."""
 
     __tablename__ = "joint_change"
 
     id: Mapped[int] = mapped_column(primary_key=True)
     joint: Mapped[str] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    object_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"), index=True)
     position: Mapped[float]
     time: Mapped[datetime]
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"))
 
-    object: Mapped[Object] = one_of(lambda: JointChange.object_id, "object")
+    object: Mapped[Object] = orm_base.one_of(lambda: JointChange.object_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 # === designators ==============================================================================================
 
 
-class DesignatorType(Base):
+class DesignatorType(orm_base.Base):
     """A declaration of a designator type; a `dtype` has several rows if its fields changed over time.
 
     Attributes:
@@ -354,10 +330,10 @@ class DesignatorType(Base):
     kind: Mapped[str]
     leaf: Mapped[str]
     concept: Mapped[str | None]
-    fields: Mapped[list[Any]] = mapped_column(JsonText())
+    fields: Mapped[list[Any]] = mapped_column(orm_base.JsonText())
 
 
-class ParameterItem(RowOfEvent, Base):
+class ParameterItem(orm_base.RowOfEvent, orm_base.Base):
     """One entry of a list or dict field. Its value is in the column of its type; a pose is in x to frame.
 
     Attributes:
@@ -370,10 +346,10 @@ class ParameterItem(RowOfEvent, Base):
     __tablename__ = "parameter_item"
     _row = "node_id"
 
-    node_id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
+    node_id: Mapped[int] = mapped_column(sa.ForeignKey("designator.id"), primary_key=True)
     field: Mapped[str] = mapped_column(primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     key: Mapped[str | None]
     integer: Mapped[int | None]
     real: Mapped[float | None]
@@ -388,11 +364,11 @@ class ParameterItem(RowOfEvent, Base):
     qz: Mapped[float | None]
     qw: Mapped[float | None]
     frame: Mapped[str | None]
-    object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    object_id: Mapped[int | None] = mapped_column(sa.ForeignKey("object.id"))
     object_name: Mapped[str | None]
     obj_type: Mapped[str | None]
 
-    object: Mapped[Object | None] = one_of(lambda: ParameterItem.object_id, "object")
+    object: Mapped[Object | None] = orm_base.one_of(lambda: ParameterItem.object_id, "object")
 
     @property
     def value(self) -> Any:
@@ -410,15 +386,15 @@ class ClassOfRow(TypeDecorator[str]):
     `PickUpAction`. No query compares it, so the rows of a type without a class are returned too.
     """
 
-    impl = String
+    impl = sa.String
     cache_ok = True
 
-    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], str | None]:  # noqa: ARG002
-        identity, mapped = known_classes(dialect).identity, Designator.__mapper__.polymorphic_map
+    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[str | None], str | None]:  # noqa: ARG002
+        identity, mapped = orm_base.known_classes(dialect).identity, Designator.__mapper__.polymorphic_map
         return lambda lineage: None if lineage is None else identity(lineage, mapped)
 
 
-class Designator(RowOfEvent, Base):
+class Designator(orm_base.RowOfEvent, orm_base.Base):
     """A performed designator; it has the id of its task tree node.
 
     Attributes:
@@ -450,31 +426,31 @@ class Designator(RowOfEvent, Base):
         # the class; that of a built-in class is the table of its designator.
         if not vars(cls).keys() & {"__table__", "__abstract__"}:
             if "__tablename__" not in vars(cls):
-                cls.__tablename__ = table_name(cls.__name__) if is_built_in(cls) else cls.__name__
+                cls.__tablename__ = table_name(cls.__name__) if orm_base.is_built_in(cls) else cls.__name__
             if "id" not in vars(cls):
                 base = _mapped_base(cls)
-                cls.id = mapped_column(ForeignKey(f"{base.__tablename__}.id"), primary_key=True, sort_order=-2)
+                cls.id = mapped_column(sa.ForeignKey(f"{base.__tablename__}.id"), primary_key=True, sort_order=-2)
         super().__init_subclass__(**arguments)
 
     @classmethod
-    def __table_cls__(cls, *arguments: Any, **options: Any) -> Table:
+    def __table_cls__(cls, *arguments: Any, **options: Any) -> sa.Table:
         # Every leaf's view also has the episode, which joins use. Queries read it from `designator` alone.
-        episode = () if cls.__name__ == "Designator" else (Column(EPISODE, BigInteger()),)
-        return Table(*arguments, *episode, **options)
+        episode = () if cls.__name__ == "Designator" else (sa.Column(orm_base.EPISODE, sa.BigInteger()),)
+        return sa.Table(*arguments, *episode, **options)
 
     @declared_attr.directive
     def __mapper_args__(cls) -> dict[str, Any]:
         arguments = {"polymorphic_identity": cls.__name__}
         if cls.__name__ == "Designator":
             return {"polymorphic_on": "_lineage", **arguments}
-        return {**arguments, **inherited_from(_mapped_base(cls), cls.__table__)}
+        return {**arguments, **orm_base.inherited_from(_mapped_base(cls), cls.__table__)}
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"))
     dtype: Mapped[str]
     kind: Mapped[str]
-    robot_state_id: Mapped[int | None] = mapped_column(ForeignKey("robot_state.id"))
-    _parameters: Mapped[dict[str, Any]] = mapped_column("parameters", JsonText(), deferred=True)
+    robot_state_id: Mapped[int | None] = mapped_column(sa.ForeignKey("robot_state.id"))
+    _parameters: Mapped[dict[str, Any]] = mapped_column("parameters", orm_base.JsonText(), deferred=True)
     _lineage: Mapped[str] = mapped_column("lineage", ClassOfRow())
     _status: Mapped[TaskStatus] = mapped_column("status")
     _start_time: Mapped[datetime] = mapped_column("start_time")
@@ -485,24 +461,24 @@ class Designator(RowOfEvent, Base):
     _end_sequence: Mapped[int | None] = mapped_column("end_sequence")
     _robot: Mapped[str | None] = mapped_column("robot")
 
-    robot_state: Mapped[RobotState | None] = one_of(lambda: Designator.robot_state_id, "robot_state")
-    items: Mapped[list[ParameterItem]] = many_of(
+    robot_state: Mapped[RobotState | None] = orm_base.one_of(lambda: Designator.robot_state_id, "robot_state")
+    items: Mapped[list[ParameterItem]] = orm_base.many_of(
         lambda: ParameterItem.node_id, "designator", order_by=(ParameterItem.field, ParameterItem.position)
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
-    _node: Mapped[TaskTreeNode] = one_of(lambda: Designator.id, "task_tree_node")
+    _node: Mapped[TaskTreeNode] = orm_base.one_of(lambda: Designator.id, "task_tree_node")
 
     # Hybrids, because a subclass may map a field of such a name, which a column of the same name would collide with.
-    status = HybridOf[TaskStatus]("status")
-    start_time = HybridOf[datetime]("start_time")
-    end_time = HybridOf[datetime | None]("end_time")
-    duration_s = HybridOf[float | None]("duration_s")
-    duration = HybridOf[float | None]("duration")
-    reason = HybridOf[str | None]("reason")
-    end_sequence = HybridOf[int | None]("end_sequence")
-    robot = HybridOf[str | None]("robot")
-    parameters = HybridOf[dict[str, Any]]("parameters", on_request=True)
-    node = HybridOf["TaskTreeNode"]("node", on_request=True)
+    status = orm_base.HybridOf[TaskStatus]("status")
+    start_time = orm_base.HybridOf[datetime]("start_time")
+    end_time = orm_base.HybridOf[datetime | None]("end_time")
+    duration_s = orm_base.HybridOf[float | None]("duration_s")
+    duration = orm_base.HybridOf[float | None]("duration")
+    reason = orm_base.HybridOf[str | None]("reason")
+    end_sequence = orm_base.HybridOf[int | None]("end_sequence")
+    robot = orm_base.HybridOf[str | None]("robot")
+    parameters = orm_base.HybridOf[dict[str, Any]]("parameters", on_request=True)
+    node = orm_base.HybridOf["TaskTreeNode"]("node", on_request=True)
 
     @hybrid_property
     def episode(self) -> ProcessMetaData:
@@ -510,12 +486,12 @@ class Designator(RowOfEvent, Base):
         return self.process_metadata
 
     @classmethod
-    def is_a(cls, concept: str) -> ColumnElement[bool]:
+    def is_a(cls, concept: str) -> sa.ColumnElement[bool]:
         """Return the condition that its type's SOMA concept is this one or a subclass of it.
 
         >>> manipulations = select(Action).where(Action.is_a("Manipulating"))
         """
-        types = select(DesignatorType.dtype).where(is_concept(DesignatorType.__table__.c.concept, concept))
+        types = sa.select(DesignatorType.dtype).where(is_concept(DesignatorType.__table__.c.concept, concept))
         return cls.dtype.in_(types)
 
     def entries(self, field: str) -> list[Any]:
@@ -529,7 +505,7 @@ class Designator(RowOfEvent, Base):
 
 def _mapped_base(class_: Any) -> Any:
     """Return the nearest mapped class that this class derives from."""
-    return next(each for each in class_.__mro__[1:] if issubclass(each, Base) and "__table__" in vars(each))
+    return next(each for each in class_.__mro__[1:] if issubclass(each, orm_base.Base) and "__table__" in vars(each))
 
 
 class Action(Designator):
@@ -558,14 +534,14 @@ class PoseParameter(MappedAsDataclass, init=False, repr=False, eq=False):
 
     @declared_attr
     def pose(cls: Any) -> Mapped[Pose]:
-        related: Mapped[Pose] = one_of(lambda: cls.pose_id, "pose")
+        related: Mapped[Pose] = orm_base.one_of(lambda: cls.pose_id, "pose")
         return related
 
 
 class TargetLocationParameter(PoseParameter):
     """A pose that the designator calls `target_location`."""
 
-    pose_id: Mapped[int] = mapped_column("target_location_id", ForeignKey("pose.id"))
+    pose_id: Mapped[int] = mapped_column("target_location_id", sa.ForeignKey("pose.id"))
 
     @declared_attr
     def target_location_id(cls) -> Mapped[int]:
@@ -579,7 +555,7 @@ class TargetLocationParameter(PoseParameter):
 class TargetParameter(PoseParameter):
     """A pose that the designator calls `target`."""
 
-    pose_id: Mapped[int] = mapped_column("target_id", ForeignKey("pose.id"), sort_order=-1)
+    pose_id: Mapped[int] = mapped_column("target_id", sa.ForeignKey("pose.id"), sort_order=-1)
 
     @declared_attr
     def target_id(cls) -> Mapped[int]:
@@ -595,14 +571,14 @@ class ObjectParameter(MappedAsDataclass, init=False, repr=False, eq=False):
 
     @declared_attr
     def object(cls: Any) -> Mapped[Object]:
-        related: Mapped[Object] = one_of(lambda: cls.object_id, "object")
+        related: Mapped[Object] = orm_base.one_of(lambda: cls.object_id, "object")
         return related
 
 
 class ObjectDesignatorParameter(ObjectParameter):
     """An object that the designator calls `object_designator`."""
 
-    object_id: Mapped[int] = mapped_column("object_designator_id", ForeignKey("object.id"), sort_order=-1)
+    object_id: Mapped[int] = mapped_column("object_designator_id", sa.ForeignKey("object.id"), sort_order=-1)
 
     @declared_attr
     def object_designator_id(cls) -> Mapped[int]:
@@ -616,7 +592,7 @@ class ObjectDesignatorParameter(ObjectParameter):
 class ObjectPartParameter(ObjectParameter):
     """An object's part that the designator calls `object_part`."""
 
-    object_id: Mapped[int] = mapped_column("object_part_id", ForeignKey("object.id"), sort_order=-1)
+    object_id: Mapped[int] = mapped_column("object_part_id", sa.ForeignKey("object.id"), sort_order=-1)
 
     @declared_attr
     def object_part_id(cls) -> Mapped[int]:
@@ -632,7 +608,7 @@ class ObjectPartParameter(ObjectParameter):
 # Map the task tree: a node for every perform, and the candidates of its location designators.
 
 
-class TaskTreeNode(RowOfEvent, Base):
+class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
     """One perform, from its start to its end.
 
     Attributes:
@@ -664,34 +640,34 @@ class TaskTreeNode(RowOfEvent, Base):
     }
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    parent_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
-    action_id: Mapped[int | None] = mapped_column(ForeignKey("designator.id"), info=COMPUTED)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    parent_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
+    action_id: Mapped[int | None] = mapped_column(sa.ForeignKey("designator.id"), info=orm_base.COMPUTED)
     kind: Mapped[str]
     dtype: Mapped[str | None] = mapped_column(index=True)
     status: Mapped[TaskStatus] = mapped_column(index=True)
     start_time: Mapped[datetime]
-    end_time: Mapped[datetime | None] = mapped_column(info=COMPUTED)
+    end_time: Mapped[datetime | None] = mapped_column(info=orm_base.COMPUTED)
     start_ns: Mapped[int]
     end_ns: Mapped[int | None]
     end_sequence: Mapped[int | None] = mapped_column(info={"storage": "number"})
     reason: Mapped[str | None]
     failure_message: Mapped[str | None]
-    failure_arguments: Mapped[list[Any] | None] = mapped_column(JsonText())
-    result: Mapped[Any | None] = mapped_column(JsonText())
-    robot_pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
+    failure_arguments: Mapped[list[Any] | None] = mapped_column(orm_base.JsonText())
+    result: Mapped[Any | None] = mapped_column(orm_base.JsonText())
+    robot_pose_id: Mapped[int | None] = mapped_column(sa.ForeignKey("pose.id"))
     torso_height: Mapped[float | None]
-    robot_object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    robot_object_id: Mapped[int | None] = mapped_column(sa.ForeignKey("object.id"))
     robot: Mapped[str | None]
     simulated: Mapped[bool]
-    duration_s: Mapped[float | None] = mapped_column(info=COMPUTED)
-    duration: Mapped[float | None] = mapped_column(info=COMPUTED)
-    outcome: Mapped[str | None] = mapped_column(deferred=True, info=COMPUTED)
+    duration_s: Mapped[float | None] = mapped_column(info=orm_base.COMPUTED)
+    duration: Mapped[float | None] = mapped_column(info=orm_base.COMPUTED)
+    outcome: Mapped[str | None] = mapped_column(deferred=True, info=orm_base.COMPUTED)
 
-    action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")
-    parent: Mapped[TaskTreeNode | None] = one_of(lambda: TaskTreeNode.parent_id, "task_tree_node")
-    children: Mapped[list[TaskTreeNode]] = many_of(
-        lambda: TaskTreeNode.parent_id, "task_tree_node", order_by=lambda: TaskTreeNode.id, info=ON_REQUEST
+    action: Mapped[Designator | None] = orm_base.one_of(lambda: TaskTreeNode.action_id, "designator")
+    parent: Mapped[TaskTreeNode | None] = orm_base.one_of(lambda: TaskTreeNode.parent_id, "task_tree_node")
+    children: Mapped[list[TaskTreeNode]] = orm_base.many_of(
+        lambda: TaskTreeNode.parent_id, "task_tree_node", order_by=lambda: TaskTreeNode.id, info=orm_base.ON_REQUEST
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
@@ -701,13 +677,13 @@ class TaskTreeNode(RowOfEvent, Base):
         nodes: list[TaskTreeNode] = []
         node: TaskTreeNode | None = self
         while node is not None:
-            require_loaded(node, "parent", self, "ancestors")
+            orm_base.require_loaded(node, "parent", self, "ancestors")
             node = node.parent
             nodes += [] if node is None else [node]
         return nodes
 
 
-class LocationCandidate(RowOfEvent, Base):
+class LocationCandidate(orm_base.RowOfEvent, orm_base.Base):
     """A place that a location designator offered; `position` is its rank, 0 first.
 
     Attributes:
@@ -717,9 +693,9 @@ class LocationCandidate(RowOfEvent, Base):
     __tablename__ = "location_candidate"
     _row = "resolution_id"
 
-    resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
+    resolution_id: Mapped[int] = mapped_column(sa.ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
@@ -741,15 +717,15 @@ class LocationCandidate(RowOfEvent, Base):
         return [Arms.named(name) for name in self.arms.split(",") if name]
 
 
-class LocationRefusal(RowOfEvent, Base):
+class LocationRefusal(orm_base.RowOfEvent, orm_base.Base):
     """A place that a location designator tried and did not offer, and the reason; `position` is its rank, 0 first."""
 
     __tablename__ = "location_refusal"
     _row = "resolution_id"
 
-    resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
+    resolution_id: Mapped[int] = mapped_column(sa.ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
@@ -761,7 +737,7 @@ class LocationRefusal(RowOfEvent, Base):
     reason: Mapped[str]
 
 
-class LocationResolution(RowOfEvent, Base):
+class LocationResolution(orm_base.RowOfEvent, orm_base.Base):
     """A location designator's answer to one request for a place.
 
     Attributes:
@@ -783,29 +759,29 @@ class LocationResolution(RowOfEvent, Base):
     __tablename__ = "location_resolution"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     location: Mapped[str]
     considered: Mapped[int]
     offered: Mapped[int]
     taken: Mapped[int | None]
-    pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
+    pose_id: Mapped[int | None] = mapped_column(sa.ForeignKey("pose.id"))
     time: Mapped[datetime]
     refused: Mapped[int]
     occupied_cells: Mapped[int | None]
     hidden_cells: Mapped[int | None]
     free_cells: Mapped[int | None]
 
-    node: Mapped[TaskTreeNode | None] = one_of(lambda: LocationResolution.node_id, "task_tree_node")
-    pose: Mapped[Pose | None] = one_of(lambda: LocationResolution.pose_id, "pose")
-    candidates: Mapped[list[LocationCandidate]] = many_of(
+    node: Mapped[TaskTreeNode | None] = orm_base.one_of(lambda: LocationResolution.node_id, "task_tree_node")
+    pose: Mapped[Pose | None] = orm_base.one_of(lambda: LocationResolution.pose_id, "pose")
+    candidates: Mapped[list[LocationCandidate]] = orm_base.many_of(
         lambda: LocationCandidate.resolution_id, "location_resolution", order_by=LocationCandidate.position
     )
-    refusals: Mapped[list[LocationRefusal]] = many_of(
+    refusals: Mapped[list[LocationRefusal]] = orm_base.many_of(
         lambda: LocationRefusal.resolution_id,
         "location_resolution",
         order_by=LocationRefusal.position,
-        info=ON_REQUEST,
+        info=orm_base.ON_REQUEST,
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
@@ -815,7 +791,7 @@ class LocationResolution(RowOfEvent, Base):
 # Map perceived objects, observations of programs, and samples of the robot's state during motions.
 
 
-class Detection(RowOfEvent, Base):
+class Detection(orm_base.RowOfEvent, orm_base.Base):
     """A percept. All percepts of one detection share their `id`; the best has `position` 0.
 
     Attributes:
@@ -836,11 +812,11 @@ class Detection(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     source: Mapped[str]
     looked_for: Mapped[ObjectType | None]
-    object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    object_id: Mapped[int | None] = mapped_column(sa.ForeignKey("object.id"))
     name: Mapped[str]
     obj_type: Mapped[ObjectType]
     x: Mapped[float]
@@ -855,12 +831,12 @@ class Detection(RowOfEvent, Base):
     confidence: Mapped[float | None]
     time: Mapped[datetime]
 
-    node: Mapped[TaskTreeNode | None] = one_of(lambda: Detection.node_id, "task_tree_node")
-    object: Mapped[Object | None] = one_of(lambda: Detection.object_id, "object")
+    node: Mapped[TaskTreeNode | None] = orm_base.one_of(lambda: Detection.node_id, "task_tree_node")
+    object: Mapped[Object | None] = orm_base.one_of(lambda: Detection.object_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
-class StateSample(RowOfEvent, Base):
+class StateSample(orm_base.RowOfEvent, orm_base.Base):
     """One channel of the robot's state at one moment of a motion, recorded if it had changed.
 
     Attributes:
@@ -874,15 +850,15 @@ class StateSample(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     channel: Mapped[str] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    object_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"))
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     value: Mapped[float]
     time: Mapped[datetime]
     ns: Mapped[int]
 
 
-class Observation(RowOfEvent, Base):
+class Observation(orm_base.RowOfEvent, orm_base.Base):
     """An observation that a program made with `memory.observe`.
 
     Attributes:
@@ -895,14 +871,14 @@ class Observation(RowOfEvent, Base):
     __tablename__ = "observation"
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
-    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
+    node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     name: Mapped[str] = mapped_column(index=True)
     time: Mapped[datetime]
     ns: Mapped[int]
 
-    node: Mapped[TaskTreeNode | None] = one_of(lambda: Observation.node_id, "task_tree_node")
-    items: Mapped[list[ObservationValue]] = many_of(
+    node: Mapped[TaskTreeNode | None] = orm_base.one_of(lambda: Observation.node_id, "task_tree_node")
+    items: Mapped[list[ObservationValue]] = orm_base.many_of(
         lambda: ObservationValue.id, "observation", order_by=lambda: ObservationValue.position
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
@@ -913,7 +889,7 @@ class Observation(RowOfEvent, Base):
         return {each.key: each.value for each in self.items}
 
 
-class ObservationValue(RowOfEvent, Base):
+class ObservationValue(orm_base.RowOfEvent, orm_base.Base):
     """A scalar or a blob of an observation. All values of one observation share their `id`.
 
     Attributes:
@@ -927,9 +903,9 @@ class ObservationValue(RowOfEvent, Base):
 
     __tablename__ = "observation_value"
 
-    id: Mapped[int] = mapped_column(ForeignKey("observation.id"), primary_key=True)
+    id: Mapped[int] = mapped_column(sa.ForeignKey("observation.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
+    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     key: Mapped[str]
     number: Mapped[float | None]
     text: Mapped[str | None]

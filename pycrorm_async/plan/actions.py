@@ -26,32 +26,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, TypeVar
 
-from pycrorm_async.plan.failures import (
-    GripperClosedCompletely,
-    IllPosedGoalFailure,
-    ObjectLost,
-    ObjectUnfetchable,
-    ObjectUnreachable,
-    Resource,
-    arms,
-    reaching,
-)
+from pycrorm_async.plan import failures, geometry, objects
+from pycrorm_async.plan.failures import arms
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.geometry import (
-    HOLD_DISTANCE_M_MAX,
-    approach,
-    check_fits,
-    check_free,
-    check_takable,
-    distance_to_box,
-    grasp_orientation,
-    grasp_pose,
-    handle_of,
-    pick_up_poses,
-    place_pose,
-    retract,
-    take,
-)
 from pycrorm_async.plan.language import ActionAbstract, ActionDescription
 from pycrorm_async.plan.locations import CostmapLocation
 from pycrorm_async.plan.motions import (
@@ -65,15 +42,6 @@ from pycrorm_async.plan.motions import (
     MoveTCPMotion,
     OpeningMotion,
     collisions_count,
-)
-from pycrorm_async.plan.objects import (
-    ObjectDesignator,
-    ObjectDesignatorDescription,
-    ObjectLike,
-    ObjectPart,
-    designator_of,
-    in_world,
-    require_robot,
 )
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, yaw_quaternion
@@ -97,11 +65,11 @@ class MoveTorsoActionPerformable(CheckedAction):
 
     position: float
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.TORSO})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.TORSO})
 
     async def perform(self) -> None:
-        await MoveJointsMotion([require_robot().torso_joint()], [self.position]).perform()
+        await MoveJointsMotion([objects.require_robot().torso_joint()], [self.position]).perform()
 
 
 @dataclass
@@ -113,7 +81,7 @@ class SetGripperActionPerformable(CheckedAction):
     gripper: Arms
     motion: GripperState
 
-    def resources(self) -> frozenset[Resource]:
+    def resources(self) -> frozenset[failures.Resource]:
         return arms(self.gripper)
 
     async def perform(self) -> None:
@@ -128,11 +96,11 @@ class ParkArmsActionPerformable(CheckedAction):
 
     arm: Arms
 
-    def resources(self) -> frozenset[Resource]:
+    def resources(self) -> frozenset[failures.Resource]:
         return arms(self.arm)
 
     async def perform(self) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         parked = {arm: robot.parked(arm) for arm in robot.each_arm(self.arm)}
         if self.arm not in (Arms.LEFT, Arms.RIGHT, Arms.BOTH):
             joints = parked[self.arm]
@@ -149,8 +117,8 @@ class NavigateActionPerformable(CheckedAction):
 
     target_location: Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.BASE})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.BASE})
 
     async def perform(self) -> None:
         await MoveMotion(self.target_location).perform()
@@ -164,8 +132,8 @@ class LookAtActionPerformable(CheckedAction):
 
     target: Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.HEAD})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.HEAD})
 
     async def perform(self) -> None:
         await LookingMotion(self.target).perform()
@@ -189,25 +157,25 @@ class PickUpActionPerformable(CheckedAction):
 
     concept: ClassVar[str | None] = "PickingUp"
 
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
     arm: Arms
     grasp: Grasp
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        robot = require_robot()
-        target = in_world(self.object_designator)
-        check_takable(robot, self.arm, target)
+        robot = objects.require_robot()
+        target = objects.in_world(self.object_designator)
+        geometry.check_takable(robot, self.arm, target)
         if collisions_count():
-            check_fits(robot, self.arm, target, grasp_orientation(target.pose, self.grasp))
-        before, at, above = pick_up_poses(target.pose, self.grasp, robot.tool_pose(self.arm))
+            geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, self.grasp))
+        before, at, above = geometry.pick_up_poses(target.pose, self.grasp, robot.tool_pose(self.arm))
         await MoveTCPMotion(before, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(at, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
-        take(robot, self.arm, target)
+        geometry.take(robot, self.arm, target)
         await MoveTCPMotion(above, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
 
 
@@ -223,24 +191,24 @@ class PlaceActionPerformable(CheckedAction):
 
     concept: ClassVar[str | None] = "Placing"
 
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
     arm: Arms
     target_location: Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        robot = require_robot()
-        body, held = robot.body, in_world(self.object_designator)
+        robot = objects.require_robot()
+        body, held = robot.body, objects.in_world(self.object_designator)
         tool_frame = robot.one_arm(self.arm).tool_frame
         if body.attachments.get(held) != tool_frame:
-            raise ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
-        goal = place_pose(self.target_location, held.pose, robot.tool_pose(self.arm))
+            raise failures.ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
+        goal = geometry.place_pose(self.target_location, held.pose, robot.tool_pose(self.arm))
         await MoveTCPMotion(goal, self.arm, _object_name=held.name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         body.detach(held)
-        await MoveTCPMotion(retract(goal), self.arm, _object_name=held.name).perform()
+        await MoveTCPMotion(geometry.retract(goal), self.arm, _object_name=held.name).perform()
 
 
 @dataclass
@@ -251,11 +219,11 @@ class FaceAtPerformable(CheckedAction):
 
     pose: Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.BASE, Resource.HEAD})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.BASE, failures.Resource.HEAD})
 
     async def perform(self) -> None:
-        base = require_robot().body.pose
+        base = objects.require_robot().body.pose
         dx, dy = self.pose.position.x - base.position.x, self.pose.position.y - base.position.y
         heading = yaw_quaternion(math.atan2(dy, dx))
         await NavigateActionPerformable(Pose(base.position, heading, base.frame)).perform()
@@ -273,17 +241,17 @@ class MoveAndPickUpPerformable(CheckedAction):
     concept: ClassVar[str | None] = "Fetching"
 
     standing_position: Pose
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
     arm: Arms
     grasp: Grasp
     policy: str | None = field(default=None, kw_only=True)
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm) | {Resource.HEAD}
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm) | {failures.Resource.HEAD}
 
     async def perform(self) -> None:
         await NavigateActionPerformable(self.standing_position).perform()
-        await FaceAtPerformable(designator_of(self.object_designator).pose).perform()
+        await FaceAtPerformable(objects.designator_of(self.object_designator).pose).perform()
         await PickUpActionPerformable(self.object_designator, self.arm, self.grasp).perform()
 
 
@@ -310,29 +278,29 @@ class GripActionPerformable(CheckedAction):
     concept: ClassVar[str | None] = "Holding"
 
     gripper: Arms
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
     effort: float
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.gripper)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.gripper)
 
     async def perform(self) -> None:
-        robot = require_robot()
-        target = in_world(self.object_designator)
+        robot = objects.require_robot()
+        target = objects.in_world(self.object_designator)
         if not self.effort >= 0:
-            raise IllPosedGoalFailure(f"effort must be >= 0 N, got {self.effort} N", self.effort)
-        check_takable(robot, self.gripper, target)
+            raise failures.IllPosedGoalFailure(f"effort must be >= 0 N, got {self.effort} N", self.effort)
+        geometry.check_takable(robot, self.gripper, target)
         tool = robot.tool_pose(self.gripper)
-        distance = min(distance_to_box(tool, target.bounding_box(link)) for link in target.links)
-        if distance > HOLD_DISTANCE_M_MAX:
+        distance = min(geometry.distance_to_box(tool, target.bounding_box(link)) for link in target.links)
+        if distance > geometry.HOLD_DISTANCE_M_MAX:
             message = (
                 f"the {self.gripper.name} gripper would close on nothing: {target.name} is {distance:.3f} m from it"
             )
-            raise GripperClosedCompletely(message, target.name, distance)
+            raise failures.GripperClosedCompletely(message, target.name, distance)
         if collisions_count():
-            check_fits(robot, self.gripper, target, tool.orientation)
+            geometry.check_fits(robot, self.gripper, target, tool.orientation)
         await MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
-        take(robot, self.gripper, target)
+        geometry.take(robot, self.gripper, target)
 
 
 @dataclass
@@ -348,17 +316,17 @@ class ReleaseActionPerformable(CheckedAction):
     concept: ClassVar[str | None] = "Releasing"
 
     gripper: Arms
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.gripper)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.gripper)
 
     async def perform(self) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         tool_frame = robot.one_arm(self.gripper).tool_frame
-        held = in_world(self.object_designator)
+        held = objects.in_world(self.object_designator)
         if robot.body.attachments.get(held) != tool_frame:
-            raise ObjectLost(f"the {self.gripper.name} gripper does not hold {held.name}", held.name)
+            raise failures.ObjectLost(f"the {self.gripper.name} gripper does not hold {held.name}", held.name)
         await MoveGripperMotion(GripperState.OPEN, self.gripper).perform()
         robot.body.detach(held)
 
@@ -380,16 +348,16 @@ class GraspingActionPerformable(CheckedAction):
     concept: ClassVar[str | None] = "Grasping"
 
     arm: Arms
-    object_desig: ObjectDesignator | Object
+    object_desig: objects.ObjectDesignator | Object
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        robot = require_robot()
-        goal, name = grasp_pose(self.object_desig), self.object_desig.name
-        check_free(robot, self.arm)
-        await MoveTCPMotion(approach(goal), self.arm, _object_name=name).perform()
+        robot = objects.require_robot()
+        goal, name = geometry.grasp_pose(self.object_desig), self.object_desig.name
+        geometry.check_free(robot, self.arm)
+        await MoveTCPMotion(geometry.approach(goal), self.arm, _object_name=name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True, _object_name=name).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm, allow_gripper_collision=True).perform()
@@ -409,14 +377,14 @@ class OpenActionPerformable(CheckedAction):
 
     concept: ClassVar[str | None] = "Opening"
 
-    object_designator: ObjectPart
+    object_designator: objects.ObjectPart
     arm: Arms
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        handle_of(self.object_designator)
+        geometry.handle_of(self.object_designator)
         await GraspingActionPerformable(self.arm, self.object_designator).perform()
         await OpeningMotion(self.object_designator, self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
@@ -428,14 +396,14 @@ class CloseActionPerformable(CheckedAction):
 
     concept: ClassVar[str | None] = "Closing"
 
-    object_designator: ObjectPart
+    object_designator: objects.ObjectPart
     arm: Arms
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        handle_of(self.object_designator)
+        geometry.handle_of(self.object_designator)
         await GraspingActionPerformable(self.arm, self.object_designator).perform()
         await ClosingMotion(self.object_designator, self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
@@ -454,12 +422,12 @@ class DetectActionPerformable(CheckedAction):
 
     concept: ClassVar[str | None] = "LookingFor"
 
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.HEAD})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.HEAD})
 
-    async def perform(self) -> ObjectDesignator:
+    async def perform(self) -> objects.ObjectDesignator:
         return await DetectingMotion(self.object_designator.object_type).perform()
 
 
@@ -481,21 +449,21 @@ class TransportActionPerformable(CheckedAction):
 
     concept: ClassVar[str | None] = "Transporting"
 
-    object_designator: ObjectDesignator | Object
+    object_designator: objects.ObjectDesignator | Object
     arm: Arms
     target_location: Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(Arms.BOTH)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(Arms.BOTH)
 
     async def perform(self) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         tool_frame = robot.one_arm(self.arm).tool_frame
-        target = in_world(self.object_designator)
-        check_takable(robot, self.arm, target)
+        target = objects.in_world(self.object_designator)
+        geometry.check_takable(robot, self.arm, target)
         is_held = robot.body.attachments.get(target) == tool_frame
         if collisions_count() and not is_held:
-            check_fits(robot, self.arm, target, grasp_orientation(target.pose, Grasp.FRONT))
+            geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, Grasp.FRONT))
         await self._park_arms()
         if not is_held:
             await self._drive(self._fetching_pose(robot.body))
@@ -508,7 +476,7 @@ class TransportActionPerformable(CheckedAction):
 
     async def _park_arms(self) -> None:
         """Park every arm that has a park posture."""
-        foldable = [arm for arm, each in require_robot().description.arms.items() if each.park]
+        foldable = [arm for arm, each in objects.require_robot().description.arms.items() if each.park]
         both = {Arms.LEFT, Arms.RIGHT}
         if both <= {*foldable}:
             foldable = [Arms.BOTH, *(arm for arm in foldable if arm not in both)]
@@ -517,14 +485,14 @@ class TransportActionPerformable(CheckedAction):
 
     async def _drive(self, place: Pose) -> None:
         """Drive to a place; a robot with a fixed base is offered no other place than its own."""
-        if require_robot().description.drive is not Drive.FIXED:
+        if objects.require_robot().description.drive is not Drive.FIXED:
             await NavigateActionPerformable(place).perform()
 
     def _fetching_pose(self, body: Object) -> Pose:
         try:
             return CostmapLocation(self.object_designator, reachable_for=body, reachable_arm=self.arm).resolve().pose
-        except ObjectUnreachable as unreachable:
-            raise ObjectUnfetchable(unreachable.message, *unreachable.data) from unreachable
+        except failures.ObjectUnreachable as unreachable:
+            raise failures.ObjectUnfetchable(unreachable.message, *unreachable.data) from unreachable
 
 
 # === descriptions =============================================================================================
@@ -534,7 +502,7 @@ class TransportActionPerformable(CheckedAction):
 T = TypeVar("T")
 
 OneOrMore: TypeAlias = T | Iterable[T]
-Objects: TypeAlias = ObjectDesignatorDescription | OneOrMore[ObjectLike]
+Objects: TypeAlias = objects.ObjectDesignatorDescription | OneOrMore[objects.ObjectLike]
 
 
 class MoveTorsoAction(ActionDescription[MoveTorsoActionPerformable]):
@@ -633,14 +601,14 @@ class GraspingAction(ActionDescription[GraspingActionPerformable]):
 class OpenAction(ActionDescription[OpenActionPerformable]):
     """Open a drawer or a door by one of these handles."""
 
-    def __init__(self, object_designator_description: OneOrMore[ObjectPart], arms: OneOrMore[Arms]) -> None:
+    def __init__(self, object_designator_description: OneOrMore[objects.ObjectPart], arms: OneOrMore[Arms]) -> None:
         super().__init__(OpenActionPerformable, object_designator=object_designator_description, arm=arms)
 
 
 class CloseAction(ActionDescription[CloseActionPerformable]):
     """Close a drawer or a door by one of these handles."""
 
-    def __init__(self, object_designator_description: OneOrMore[ObjectPart], arms: OneOrMore[Arms]) -> None:
+    def __init__(self, object_designator_description: OneOrMore[objects.ObjectPart], arms: OneOrMore[Arms]) -> None:
         super().__init__(CloseActionPerformable, object_designator=object_designator_description, arm=arms)
 
 

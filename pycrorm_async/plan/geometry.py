@@ -6,28 +6,11 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from pycrorm_async.plan.failures import (
-    CapabilityAbsenceFailure,
-    EndEffectorFailure,
-    EnvironmentManipulationImpossible,
-    IllPosedGoalFailure,
-    PerceptionObjectNotInWorld,
-)
+from pycrorm_async.plan import failures
 from pycrorm_async.plan.objects import CurrentRobot, ObjectLike, ObjectPart, in_world
+from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.pose import (
-    Arms,
-    Grasp,
-    GripperState,
-    JointType,
-    ObjectType,
-    Pose,
-    Quaternion,
-    dot,
-    product,
-    rotated,
-)
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, ArmDescription
 
 # === articulation =============================================================================================
@@ -69,14 +52,16 @@ def handle_of(part: ObjectLike, joint: str | None = None) -> Handle:
         UnknownLink: that object has no such link.
     """
     if not isinstance(part, ObjectPart):
-        raise EnvironmentManipulationImpossible(
+        raise failures.EnvironmentManipulationImpossible(
             f"{part.name} is not part of an object: pass the handle as ObjectPart(handle, object)", part.name
         )
     whole = in_world(part.part_of)
     joints = whole.joints_above(part.name)
     if not joints or joint not in (None, *joints):
         mover = "no joint" if joint is None else f"no joint {joint}"
-        raise EnvironmentManipulationImpossible(f"{mover} of {whole.name} moves {part.name}", part.name, whole.name)
+        raise failures.EnvironmentManipulationImpossible(
+            f"{mover} of {whole.name} moves {part.name}", part.name, whole.name
+        )
     return Handle(whole, part.name, joint or joints[0])
 
 
@@ -107,18 +92,18 @@ def moved_position(handle: Handle, distance: float) -> float:
     if not lower - _ROUNDING <= goal <= upper + _ROUNDING:
         limits = f"its limits are {lower:g} to {upper:g}"
         message = f"{handle.joint} at {handle.position:g} cannot move by {distance:g}: {limits}"
-        raise EnvironmentManipulationImpossible(message, handle.link, handle.joint, distance)
+        raise failures.EnvironmentManipulationImpossible(message, handle.link, handle.joint, distance)
     return min(max(goal, lower), upper)
 
 
-def handle_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
+def handle_poses(handle: Handle, goal: float, start: float | None = None) -> list[poses.Pose]:
     """Return poses of the handle's frame while its joint moves to `goal`: the start, points between, the goal.
 
     Args:
         start: the joint's first position; None means the current one.
     """
     begin = handle.position if start is None else start
-    step = STEP_M_MAX if handle.whole.joint_type(handle.joint) is JointType.PRISMATIC else STEP_RAD_MAX
+    step = STEP_M_MAX if handle.whole.joint_type(handle.joint) is poses.JointType.PRISMATIC else STEP_RAD_MAX
     count = max(1, math.ceil(abs(goal - begin) / step - _ROUNDING))
     return [
         handle.whole.link_pose_at(handle.link, {handle.joint: begin + (goal - begin) * number / count})
@@ -126,34 +111,34 @@ def handle_poses(handle: Handle, goal: float, start: float | None = None) -> lis
     ]
 
 
-def hold_pose(handle: Handle) -> Pose:
+def hold_pose(handle: Handle) -> poses.Pose:
     """Return the pose of the tool frame relative to the handle's frame in a grasp.
 
     A drawer's handle is grasped from the front, with the handle's orientation. A door's handle is grasped from the side
     of the hinge: the hand is rotated by 90 degrees about the hinge's axis and points away from the hinge. The moving
     door rotates the hand, and a hand that starts straight could not follow it from any base pose.
     """
-    if handle.whole.joint_type(handle.joint) is JointType.PRISMATIC:
-        return Pose()
+    if handle.whole.joint_type(handle.joint) is poses.JointType.PRISMATIC:
+        return poses.Pose()
     # Half a turn of the joint would bring the handle to the opposite side of the hinge: this locates the hinge.
     current = handle.whole.link_pose(handle.link)
     opposite = handle.whole.link_pose_at(handle.link, {handle.joint: handle.position + math.pi}).relative_to(current)
     x, y, z, _ = opposite.orientation
     from_hinge = [-across / 2 for across in opposite.position]
     for side in (1.0, -1.0):
-        turn = Pose(orientation=(side * x, side * y, side * z, 1.0))
-        if dot(rotated(turn.orientation, (1.0, 0.0, 0.0)), from_hinge) > 0.0:
+        turn = poses.Pose(orientation=(side * x, side * y, side * z, 1.0))
+        if poses.dot(poses.rotated(turn.orientation, (1.0, 0.0, 0.0)), from_hinge) > 0.0:
             break
     return turn
 
 
-def hand_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
+def hand_poses(handle: Handle, goal: float, start: float | None = None) -> list[poses.Pose]:
     """Return poses as `handle_poses` does, but of the tool frame of a hand that holds the handle."""
     grip = hold_pose(handle)
     return [each @ grip for each in handle_poses(handle, goal, start)]
 
 
-def grasp_pose(target: ObjectLike) -> Pose:
+def grasp_pose(target: ObjectLike) -> poses.Pose:
     """Return the tool frame's pose for grasping: an object's own frame, or a handle's `hold_pose`.
 
     Raises:
@@ -172,7 +157,7 @@ def _limits(handle: Handle) -> tuple[float, float]:
     lower, upper = handle.whole.joint_limits(handle.joint)
     if not math.isfinite(upper - lower):
         message = f"{handle.joint} has no limits, so it has no open and no closed position"
-        raise EnvironmentManipulationImpossible(message, handle.link, handle.joint)
+        raise failures.EnvironmentManipulationImpossible(message, handle.link, handle.joint)
     return lower, upper
 
 
@@ -195,48 +180,48 @@ HOLD_DISTANCE_M_MAX = 0.03
 class PickUpPoses(NamedTuple):
     """The three goals of the tool frame in a pick-up, in order."""
 
-    before: Pose
-    at: Pose
-    above: Pose
+    before: poses.Pose
+    at: poses.Pose
+    above: poses.Pose
 
 
-def pick_up_poses(object_pose: Pose, grasp: Grasp, tool: Pose) -> PickUpPoses:
+def pick_up_poses(object_pose: poses.Pose, grasp: poses.Grasp, tool: poses.Pose) -> PickUpPoses:
     """Return the goals for an object at this pose and a tool frame that is at `tool` now.
 
     The approach follows the gripper's *current* direction, not the direction it will have at the object.
     """
     orientation = grasp_orientation(object_pose, grasp)
-    back = rotated(tool.orientation, (-APPROACH_M, 0.0, 0.0))
+    back = poses.rotated(tool.orientation, (-APPROACH_M, 0.0, 0.0))
     x, y, z = object_pose.position
     frame = object_pose.frame
     return PickUpPoses(
-        Pose((x + back.x, y + back.y, z + back.z), orientation, frame),
-        Pose((x, y, z), orientation, frame),
-        Pose((x, y, z + LIFT_M), orientation, frame),
+        poses.Pose((x + back.x, y + back.y, z + back.z), orientation, frame),
+        poses.Pose((x, y, z), orientation, frame),
+        poses.Pose((x, y, z + LIFT_M), orientation, frame),
     )
 
 
-def grasp_orientation(object_pose: Pose, grasp: Grasp) -> Quaternion:
+def grasp_orientation(object_pose: poses.Pose, grasp: poses.Grasp) -> poses.Quaternion:
     """Return the tool frame's orientation in a grasp of an object at this pose."""
-    return product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
+    return poses.product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
 
 
-def place_pose(target: Pose, held: Pose, tool: Pose) -> Pose:
+def place_pose(target: poses.Pose, held: poses.Pose, tool: poses.Pose) -> poses.Pose:
     """Return the pose of the tool frame that brings the held object to `target`."""
     return target @ tool.relative_to(held)
 
 
-def approach(tool: Pose) -> Pose:
+def approach(tool: poses.Pose) -> poses.Pose:
     """Return the pose from which the tool frame moves straight ahead, along its fingers, to `tool`."""
-    return tool @ Pose((-APPROACH_M, 0.0, 0.0))
+    return tool @ poses.Pose((-APPROACH_M, 0.0, 0.0))
 
 
-def retract(tool: Pose) -> Pose:
+def retract(tool: poses.Pose) -> poses.Pose:
     """Return the pose of the tool frame after moving back along its fingers."""
-    return tool @ Pose((-RETRACT_M, 0.0, 0.0))
+    return tool @ poses.Pose((-RETRACT_M, 0.0, 0.0))
 
 
-def distance_to_box(tool: Pose, box: BoundingBox) -> float:
+def distance_to_box(tool: poses.Pose, box: BoundingBox) -> float:
     """Return the distance of the tool frame from the box, m; 0 inside."""
     return math.hypot(
         *(max(low - at, at - high, 0.0) for at, low, high in zip(tool.position, box.min, box.max, strict=True))
@@ -248,7 +233,7 @@ def distance_to_box(tool: Pose, box: BoundingBox) -> float:
 # Check whether a gripper can take an object, and attach the object to it.
 
 
-def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
+def check_takable(robot: CurrentRobot, arm: poses.Arms, target: Object) -> None:
     """Check that the gripper can take the object, and that the arm lifts it with all that is attached to it.
 
     Raises:
@@ -259,14 +244,14 @@ def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
             payload. A mass that is not known counts as 0.
     """
     check_same_world(robot, target)
-    if target.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
-        raise IllPosedGoalFailure(f"{target.name} cannot be held by a gripper", target.name)
+    if target.object_type in (poses.ObjectType.ROBOT, poses.ObjectType.ENVIRONMENT):
+        raise failures.IllPosedGoalFailure(f"{target.name} cannot be held by a gripper", target.name)
     check_free(robot, arm, target)
     if (overload := _overload(robot.one_arm(arm), arm, target)) is not None:
         raise overload
 
 
-def lifting_arms(robot: CurrentRobot, among: Iterable[Arms], target: ObjectLike) -> tuple[Arms, ...]:
+def lifting_arms(robot: CurrentRobot, among: Iterable[poses.Arms], target: ObjectLike) -> tuple[poses.Arms, ...]:
     """Return the arms of `among` that lift the object; all of them if none does, so that the action names the reason.
 
     Returns all of them also for a part of an object, and for an object that is not in the world. An arm that the robot
@@ -277,7 +262,7 @@ def lifting_arms(robot: CurrentRobot, among: Iterable[Arms], target: ObjectLike)
         return arms
     try:
         load = in_world(target)
-    except PerceptionObjectNotInWorld:
+    except failures.PerceptionObjectNotInWorld:
         return arms
     too_weak = {arm for arm in arms if arm in described and _overload(described[arm], arm, load) is not None}
     if too_weak.issuperset(arm for arm in arms if arm in described):
@@ -285,48 +270,48 @@ def lifting_arms(robot: CurrentRobot, among: Iterable[Arms], target: ObjectLike)
     return tuple(arm for arm in arms if arm not in too_weak)
 
 
-def _overload(described: ArmDescription, arm: Arms, target: Object) -> CapabilityAbsenceFailure | None:
+def _overload(described: ArmDescription, arm: poses.Arms, target: Object) -> failures.CapabilityAbsenceFailure | None:
     """Return the failure of lifting the object and all that is attached to it; None within the arm's payload."""
     mass_kg = sum(each.mass_kg or 0.0 for each in (target, *target.world.attachments.below(target)))
     if described.payload_kg is None or mass_kg <= described.payload_kg:
         return None
     message = f"{target.name} weighs {mass_kg:g} kg, the {arm.name} arm lifts {described.payload_kg:g} kg"
-    return CapabilityAbsenceFailure(message, target.name, mass_kg, described.payload_kg)
+    return failures.CapabilityAbsenceFailure(message, target.name, mass_kg, described.payload_kg)
 
 
 def check_same_world(robot: CurrentRobot, obj: Object) -> None:
     """Raise `PerceptionObjectNotInWorld` if the object is in another world than the robot."""
     if obj.world is not robot.body.world:
-        raise PerceptionObjectNotInWorld(f"{obj.name} is in another world than {robot.body.name}", obj.name)
+        raise failures.PerceptionObjectNotInWorld(f"{obj.name} is in another world than {robot.body.name}", obj.name)
 
 
-def check_free(robot: CurrentRobot, arm: Arms, *but: Object) -> None:
+def check_free(robot: CurrentRobot, arm: poses.Arms, *but: Object) -> None:
     """Raise `EndEffectorFailure` if the gripper holds an object other than `but`.
 
     Raises `CapabilityAbsenceFailure` if there is no such gripper.
     """
-    robot.gripper_joints(arm, GripperState.CLOSE)
+    robot.gripper_joints(arm, poses.GripperState.CLOSE)
     tool_frame = robot.one_arm(arm).tool_frame
     for obj, link in robot.body.attachments.items():
         if link == tool_frame and obj not in but:
-            raise EndEffectorFailure(f"the {arm.name} gripper holds {obj.name}: place or release it", obj.name)
+            raise failures.EndEffectorFailure(f"the {arm.name} gripper holds {obj.name}: place or release it", obj.name)
 
 
-def check_fits(robot: CurrentRobot, arm: Arms, target: Object, tool: Quaternion) -> None:
+def check_fits(robot: CurrentRobot, arm: poses.Arms, target: Object, tool: poses.Quaternion) -> None:
     """Raise `CapabilityAbsenceFailure` if the object is wider than the opening of a gripper with this orientation.
 
     The width, m, is that of the whole object along the direction in which the fingers close.
     """
-    across = Pose((0.0, 0.0, 0.0), tool).inverse()
+    across = poses.Pose((0.0, 0.0, 0.0), tool).inverse()
     frames = [(across @ target.link_pose(link), target.body.solids[link]) for link in target.links]
     box = box_around([((frame.position, frame.orientation), solids) for frame, solids in frames])
     width, opening = box.size.y if box is not None else 0.0, robot.one_arm(arm).opening_m
     if opening is not None and width > opening:
         message = f"{target.name} is {width:.3f} m wide between the fingers, the {arm.name} gripper opens {opening:g} m"
-        raise CapabilityAbsenceFailure(message, target.name, width, opening)
+        raise failures.CapabilityAbsenceFailure(message, target.name, width, opening)
 
 
-def take(robot: CurrentRobot, arm: Arms, target: Object) -> None:
+def take(robot: CurrentRobot, arm: poses.Arms, target: Object) -> None:
     """Attach the object to the gripper and detach it from its former parent."""
     tool_frame = robot.one_arm(arm).tool_frame
     if robot.body.attachments.get(target) == tool_frame:

@@ -58,21 +58,8 @@ from numbers import Real
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, NoReturn, Self, TypeAlias, TypeVar
 
+from pycrorm_async.plan import failures as plan_failures
 from pycrorm_async.plan.execution import Arbiter, ExecutionContext, execution_context, is_wrapped, wrap_perform
-from pycrorm_async.plan.failures import (
-    NOTHING,
-    FieldHidesMethod,
-    IllPosedGoalFailure,
-    NoRobotHere,
-    NotALanguageExpression,
-    NotResolved,
-    PerformNotAsync,
-    PlanFailures,
-    Resource,
-    ResourcesNotAMethod,
-    describe_error,
-    is_plan_failure,
-)
 from pycrorm_async.plan.field_types import check_properties, record_arguments
 from pycrorm_async.plan.geometry import lifting_arms
 from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike, require_robot
@@ -163,7 +150,7 @@ class ActionDescription(Composable, Generic[P]):
 
         def __getattr__(self, name: str) -> NoReturn:
             if name == "perform" or name in self.__dict__.get("_alternatives", ()):
-                raise NotResolved(type(self).__name__, name)
+                raise plan_failures.NotResolved(type(self).__name__, name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def resolve(self) -> P:
@@ -202,7 +189,7 @@ class ActionDescription(Composable, Generic[P]):
         if isinstance(among, ObjectDesignatorDescription):
             return tuple(among) or (among.resolve(),)
         if not among:
-            raise IllPosedGoalFailure(f"{type(self).__name__} has no alternative for {name}", name)
+            raise plan_failures.IllPosedGoalFailure(f"{type(self).__name__} has no alternative for {name}", name)
         return among
 
 
@@ -210,7 +197,7 @@ def _arms_for(load: ObjectLike, arms: tuple[Arms, ...]) -> tuple[Arms, ...]:
     """Return the arms that lift the object; all of them outside a world with a robot."""
     try:
         return lifting_arms(require_robot(), arms, load)
-    except (NoWorld, NoRobotHere):
+    except (NoWorld, plan_failures.NoRobotHere):
         return arms
 
 
@@ -273,9 +260,9 @@ class Designator(Composable, metaclass=DescribedClass):
         super().__init_subclass__(**arguments)
         own, parameters = vars(cls), _annotated(cls)
         if "resources" in parameters or not callable(own.get("resources", len)):
-            raise ResourcesNotAMethod(cls.__qualname__)
+            raise plan_failures.ResourcesNotAMethod(cls.__qualname__)
         if (hidden := next((name for name in parameters if _is_method(cls, name)), None)) is not None:
-            raise FieldHidesMethod(cls.__qualname__, hidden)
+            raise plan_failures.FieldHidesMethod(cls.__qualname__, hidden)
         _describe(cls, {name: value for name, value in own.items() if name not in parameters})
         for name in ("kind", "dtype", "concept", "orm_class"):
             owner = next((each for each in cls.__mro__ if name in vars(each)), Designator)
@@ -292,7 +279,7 @@ class Designator(Composable, metaclass=DescribedClass):
         if perform is None or is_wrapped(perform):  # dataclass(slots=True) copies a class whose `perform` is wrapped
             return
         if not inspect.iscoroutinefunction(perform):
-            raise PerformNotAsync(cls.__qualname__)
+            raise plan_failures.PerformNotAsync(cls.__qualname__)
         cls.perform = wrap_perform(perform)  # type: ignore[assignment]  # the wrapper replaces the method
 
     @classmethod
@@ -303,9 +290,9 @@ class Designator(Composable, metaclass=DescribedClass):
     async def perform(self) -> Any:
         """Perform the designator and return when it has ended. Raises a `PlanFailure` if it fails."""
 
-    def resources(self) -> frozenset[Resource]:
+    def resources(self) -> frozenset[plan_failures.Resource]:
         """Return the parts of the robot it uses exclusively from start to end; nested designators declare their own."""
-        return NOTHING
+        return plan_failures.NOTHING
 
 
 def _is_built_in(designator: type) -> bool:
@@ -394,7 +381,7 @@ class Expression(Designator):
         """Check the operands and store them."""
         self.operands = tuple(_check_operand(each, type(self).__name__) for each in operands)
         if not self.operands:
-            raise NotALanguageExpression(f"{type(self).__name__} needs something to perform")
+            raise plan_failures.NotALanguageExpression(f"{type(self).__name__} needs something to perform")
 
     @property
     def is_complete(self) -> bool:
@@ -487,7 +474,9 @@ class Repeat(Expression):
         except TypeError:
             self.times = -1
         if isinstance(times, bool) or self.times < 0:
-            raise NotALanguageExpression(f"Repeat needs an integer times >= 0, got {times!r}", repr(times))
+            raise plan_failures.NotALanguageExpression(
+                f"Repeat needs an integer times >= 0, got {times!r}", repr(times)
+            )
         self.hold([operand])
 
     async def perform(self) -> Outcome:
@@ -534,7 +523,9 @@ class Code(Designator):
 
     def __init__(self, function: Callable[..., Any], /, **arguments: Any) -> None:
         if not callable(function):
-            raise NotALanguageExpression(f"Code needs a function, got {_short(function)}", _short(function))
+            raise plan_failures.NotALanguageExpression(
+                f"Code needs a function, got {_short(function)}", _short(function)
+            )
         self.function = name_of(function)
         self.arguments = {name: _short(value) for name, value in arguments.items()}
         self._call = functools.partial(function, **arguments)
@@ -597,7 +588,7 @@ async def _run_branches(expression: Expression) -> list[Attempt]:
 def _check_operand(operand: Any, where: str) -> Any:
     """Return the operand. Raises `NotALanguageExpression` if it is not performable."""
     if isinstance(operand, Expression) and not operand.is_complete:
-        raise NotALanguageExpression(
+        raise plan_failures.NotALanguageExpression(
             f"this Monitor has no operand, so {where} cannot perform it: write plan >> Monitor(condition)"
         )
     if isinstance(operand, Designator | ActionDescription):
@@ -605,7 +596,7 @@ def _check_operand(operand: Any, where: str) -> Any:
     advice = ""
     if callable(operand):
         advice = ": make an instance" if isinstance(operand, type) else ": wrap it in Code(…)"
-    raise NotALanguageExpression(
+    raise plan_failures.NotALanguageExpression(
         f"{where} needs designators or descriptions of actions, got {_short(operand)}{advice}", _short(operand)
     )
 
@@ -615,7 +606,7 @@ def _short(value: Any) -> str:
     try:
         text = repr(value)
     except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
-        text = f"<{type(value).__name__}: {describe_error(error)}>"
+        text = f"<{type(value).__name__}: {plan_failures.describe_error(error)}>"
     return text if len(text) <= 100 else f"{text[:99]}…"
 
 
@@ -659,7 +650,7 @@ class Outcome:
             return {"rounds": self.rounds}
         brief: dict[str, Any] = {"succeeded": list(self.succeeded)}
         if self.failures:
-            brief["failures"] = [describe_error(each) for each in self.failures]
+            brief["failures"] = [plan_failures.describe_error(each) for each in self.failures]
         return brief
 
 
@@ -675,7 +666,7 @@ async def attempt(perform: Callable[[], Any]) -> Attempt:
     try:
         return Attempt(await perform())
     except Exception as error:
-        if not is_plan_failure(error):
+        if not plan_failures.is_plan_failure(error):
             raise
         return Attempt(failure=error)
 
@@ -687,14 +678,16 @@ def combine_failures(failures: list[Exception], summary: str) -> Exception:
     reference cycle.
     """
     error = (
-        failures[0] if len(failures) == 1 else PlanFailures(f"{summary}: {_list_failures(failures)}", tuple(failures))
+        failures[0]
+        if len(failures) == 1
+        else plan_failures.PlanFailures(f"{summary}: {_list_failures(failures)}", tuple(failures))
     )
     failures.clear()
     return error
 
 
 def _list_failures(failures: list[Exception]) -> str:
-    named = [describe_error(each) for each in failures[:_NAMED_MAX]]
+    named = [plan_failures.describe_error(each) for each in failures[:_NAMED_MAX]]
     more = len(failures) - len(named)
     return "; ".join([*named, f"and {more} more"] if more else named)
 
@@ -732,19 +725,21 @@ class Monitor(Expression):
     def __init__(self, condition: Condition, interval_s: float = 0.1) -> None:
         checked: object = condition
         if not (callable(checked) or isinstance(checked, asyncio.Event)):
-            raise NotALanguageExpression(
+            raise plan_failures.NotALanguageExpression(
                 f"Monitor needs a callable or an asyncio.Event, got {type(checked).__name__}: write a function that"
                 " returns whether to interrupt",
                 repr(checked),
             )
         if isinstance(getattr(checked, "__self__", None), asyncio.Event) and name_of(checked).endswith("Event.wait"):
-            raise NotALanguageExpression(
+            raise plan_failures.NotALanguageExpression(
                 "Monitor evaluates its condition before each node, so one that waits keeps the plan from starting: pass"
                 " the Event itself, not its wait",
                 repr(checked),
             )
         if isinstance(interval_s, bool) or not isinstance(interval_s, Real) or not 0 < interval_s < math.inf:
-            raise NotALanguageExpression(f"Monitor needs a finite interval_s > 0, got {interval_s!r}", interval_s)
+            raise plan_failures.NotALanguageExpression(
+                f"Monitor needs a finite interval_s > 0, got {interval_s!r}", interval_s
+            )
         self.condition = name_of(condition)
         self.interval_s = float(interval_s)
         self._condition: Condition = condition
@@ -756,7 +751,7 @@ class Monitor(Expression):
     async def perform(self) -> Outcome:
         """Return an `Outcome` with one result, or one with `interrupted` set. Raises the operand's exceptions."""
         if not self.operands:
-            raise NotALanguageExpression("this Monitor has no operand: write plan >> Monitor(condition)")
+            raise plan_failures.NotALanguageExpression("this Monitor has no operand: write plan >> Monitor(condition)")
         watch = Watch(self._condition)
         task = asyncio.create_task(self._perform_watched(watch), name=f"watched by {self.condition}")
         watch.set_task(task)
@@ -789,11 +784,13 @@ class Monitor(Expression):
 def watch_operand(operand: Composable, monitor: Composable) -> Monitor:
     """Implement `operand >> monitor`: copy the monitor and give it this operand. Raises `NotALanguageExpression`."""
     if not isinstance(monitor, Monitor):
-        raise NotALanguageExpression(
+        raise plan_failures.NotALanguageExpression(
             f"the right operand of >> must be a Monitor, got {name_of(monitor)}", name_of(monitor)
         )
     if monitor.operands:
-        raise NotALanguageExpression("this Monitor has an operand already: create another Monitor for this plan")
+        raise plan_failures.NotALanguageExpression(
+            "this Monitor has an operand already: create another Monitor for this plan"
+        )
     monitor_copy = copy.copy(monitor)
     monitor_copy.hold([operand])
     return monitor_copy

@@ -34,56 +34,16 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 import numpy as np
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.plan import failures, geometry, objects
 from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Search, recorder
-from pycrorm_async.plan.failures import (
-    EnvironmentUnreachable,
-    LookingHighLevelFailure,
-    NoRobotHere,
-    NotResolved,
-    ObjectUnavailable,
-    ObjectUnreachable,
-    PlanFailure,
-    ReachabilityFailure,
-)
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.geometry import (
-    Handle,
-    approach,
-    closed_position,
-    hand_poses,
-    handle_of,
-    lifting_arms,
-    opened_position,
-    pick_up_poses,
-    place_pose,
-    retract,
-)
 from pycrorm_async.plan.motions import arm_collision, chosen_limits, collisions_count
-from pycrorm_async.plan.objects import (
-    CurrentRobot,
-    ObjectDesignator,
-    ObjectLike,
-    ObjectPart,
-    check_in_map,
-    designator_of,
-    in_world,
-    pose_of,
-    require_robot,
-    require_world,
-)
 from pycrorm_async.plan.task import Experience, PastSuccess, current_node, experience
+from pycrorm_async.world import queries
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object, current_world
 from pycrorm_async.world.kinematics import Unreachable, headings, solve
 from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, rotated, yaw_quaternion
-from pycrorm_async.world.queries import (
-    Costmap,
-    GaussianCostmap,
-    Obstacles,
-    OccupancyCostmap,
-    VisibilityCostmap,
-    footprint_of,
-)
 from pycrorm_async.world.urdf import Drive, PR2Description
 from pycrorm_async.world.world_copy import acting_robot
 
@@ -95,9 +55,11 @@ from pycrorm_async.world.world_copy import acting_robot
 class BaseClearance:
     """The footprints of one or more robots, and the obstacles around them as they are now."""
 
-    def __init__(self, robots: Collection[CurrentRobot]) -> None:
-        self._footprints = [footprint_of(each.body, each.base_links()) for each in robots]
-        self._obstacles = Obstacles(require_world(), ignore={part for each in robots for part in each.with_load()})
+    def __init__(self, robots: Collection[objects.CurrentRobot]) -> None:
+        self._footprints = [queries.footprint_of(each.body, each.base_links()) for each in robots]
+        self._obstacles = queries.Obstacles(
+            objects.require_world(), ignore={part for each in robots for part in each.with_load()}
+        )
 
     def refusal(self, base: Pose) -> str | None:
         """Return the reason why a base cannot be at this pose; None if it is clear of obstacles there."""
@@ -106,18 +68,18 @@ class BaseClearance:
                 return "base in collision with {} ({})".format(*obstacle)
         return None
 
-    def costmap(self, origin: Pose, *, size_cells: int = 200, resolution_m: float = 0.02) -> Costmap:
+    def costmap(self, origin: Pose, *, size_cells: int = 200, resolution_m: float = 0.02) -> queries.Costmap:
         """Return the places that a base may have with some heading: 1 where nothing is within its inner radius."""
         distance_m = max(each.inner_radius_m for each in self._footprints)
         return self._obstacles.costmap(origin, distance_m=distance_m, size_cells=size_cells, resolution_m=resolution_m)
 
 
-def base_clearance(robots: Collection[CurrentRobot] = ()) -> BaseClearance | None:
+def base_clearance(robots: Collection[objects.CurrentRobot] = ()) -> BaseClearance | None:
     """Return the clearance of these robots, of the current one without any; None where collisions do not count.
 
     Raises `NoRobotHere` if collisions count and there is no robot.
     """
-    return BaseClearance(robots or (require_robot(),)) if collisions_count() else None
+    return BaseClearance(robots or (objects.require_robot(),)) if collisions_count() else None
 
 
 # === base poses ===============================================================================================
@@ -141,10 +103,10 @@ class PlaceReach(NamedTuple):
 
 
 def base_poses(
-    target: Pose | ObjectLike,
+    target: Pose | objects.ObjectLike,
     *,
-    reachable_for: ObjectLike | None,
-    visible_for: ObjectLike | None,
+    reachable_for: objects.ObjectLike | None,
+    visible_for: objects.ObjectLike | None,
     reachable_arm: Arms | None,
 ) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
     """Yield the cells of the costmaps, then base poses that face the target, best first, suitable or not.
@@ -153,8 +115,8 @@ def base_poses(
     """
     reacher = resolve_robot(reachable_for) if reachable_for is not None else None
     viewer = resolve_robot(visible_for) if visible_for is not None else None
-    goal = target if isinstance(target, Pose) else pose_of(target)
-    check_in_map(goal)
+    goal = target if isinstance(target, Pose) else objects.pose_of(target)
+    objects.check_in_map(goal)
     arms = _arms(reacher, reachable_arm, target) if reacher is not None else reachable_arm
     if reacher is not None and reacher.description.drive is Drive.FIXED:
         yield _checked(reacher.body.pose, target, goal, reacher, viewer, arms)
@@ -182,16 +144,20 @@ def base_poses(
         yield place
 
 
-def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> Arms | tuple[Arms, ...]:
+def _arms(robot: objects.CurrentRobot, arm: Arms | None, target: Pose | objects.ObjectLike) -> Arms | tuple[Arms, ...]:
     """Return the required arm; without one those that lift the target, or reach it if it is a pose."""
     if arm is not None:
         return arm
     candidates = tuple(robot.description.arms)
-    return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
+    return candidates if isinstance(target, Pose) else geometry.lifting_arms(robot, candidates, target)
 
 
 def _headings(
-    robot: CurrentRobot, arms: Arms | tuple[Arms, ...] | None, facing: Pose, target: Pose | ObjectLike, goal: Pose
+    robot: objects.CurrentRobot,
+    arms: Arms | tuple[Arms, ...] | None,
+    facing: Pose,
+    target: Pose | objects.ObjectLike,
+    goal: Pose,
 ) -> Iterator[Pose]:
     """Yield the poses of the base to check at a place, each once: for most arms the one that faces the target."""
     headings_yielded: set[Pose] = set()
@@ -204,14 +170,14 @@ def _headings(
             headings_yielded.add(pose)
 
 
-def _each(robot: CurrentRobot, arm: Arms | tuple[Arms, ...] | None) -> tuple[Arms, ...]:
+def _each(robot: objects.CurrentRobot, arm: Arms | tuple[Arms, ...] | None) -> tuple[Arms, ...]:
     """Return the arms of a choice: both of BOTH, these of several, all of None."""
     if isinstance(arm, tuple):
         return arm
     return tuple(robot.description.arms if arm is None else robot.each_arm(arm))
 
 
-def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:
+def _cells(costmap: queries.Costmap, robots: list[objects.CurrentRobot], *, every: bool) -> Iterator[Pose]:
     """Yield the middles of the cells to search: the best ones, or with `every` all of them.
 
     The best cells are as near to the target as is usual for a PR2. For other robots, whose arms reach from other
@@ -224,10 +190,10 @@ def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iter
 
 def _checked(
     base_pose: Pose,
-    target: Pose | ObjectLike,
+    target: Pose | objects.ObjectLike,
     goal: Pose,
-    reacher: CurrentRobot | None,
-    viewer: CurrentRobot | None,
+    reacher: objects.CurrentRobot | None,
+    viewer: objects.CurrentRobot | None,
     arms: Arms | tuple[Arms, ...] | None,
 ) -> tuple[Pose, PlaceReach]:
     """Return the base pose with the arms that reach the target from there, or with the reason why none does."""
@@ -239,15 +205,15 @@ def _checked(
     return base_pose, reaching_arms(reacher, arms, base_pose, goals, grasps=not isinstance(target, Pose))
 
 
-def resolve_robot(meant: ObjectLike) -> CurrentRobot:
+def resolve_robot(meant: objects.ObjectLike) -> objects.CurrentRobot:
     """Return the robot that the argument refers to. Raises `NoRobotHere` if it has no robot description."""
-    body = in_world(meant)
+    body = objects.in_world(meant)
     if body.robot_description is None:
-        raise NoRobotHere(f"{body.name!r} is not a robot with a robot description")
-    return CurrentRobot(body, body.robot_description)
+        raise failures.NoRobotHere(f"{body.name!r} is not a robot with a robot description")
+    return objects.CurrentRobot(body, body.robot_description)
 
 
-def base_height_m(robot: CurrentRobot | None = None) -> float:
+def base_height_m(robot: objects.CurrentRobot | None = None) -> float:
     """Return the height of a robot's base link, which driving keeps: of this robot, else of the acting one, else 0."""
     if robot is not None:
         return robot.body.pose.position.z
@@ -264,7 +230,7 @@ def face(place: Pose, goal: Pose, *, height_m: float, turned: float = 0.0) -> Po
 
 
 def reaching_arms(
-    robot: CurrentRobot,
+    robot: objects.CurrentRobot,
     arm: Arms | tuple[Arms, ...] | None,
     base_pose: Pose,
     goals: Callable[[Arms], Iterable[Pose]],
@@ -305,7 +271,7 @@ def reaching_arms(
 
 
 def _collision(
-    robot: CurrentRobot, arm: Arms, postures: Iterable[dict[str, float]], base: Pose, *, grasps: bool
+    robot: objects.CurrentRobot, arm: Arms, postures: Iterable[dict[str, float]], base: Pose, *, grasps: bool
 ) -> tuple[str, Object] | None:
     """Return the first collision of the arm at these postures, as its motions will find it."""
     tool_frame = robot.description.arms[arm].tool_frame
@@ -319,50 +285,54 @@ def _collision(
 
 
 def _costmap(
-    target: Pose | ObjectLike,
+    target: Pose | objects.ObjectLike,
     goal: Pose,
-    robots: list[CurrentRobot],
-    viewer: CurrentRobot | None,
+    robots: list[objects.CurrentRobot],
+    viewer: objects.CurrentRobot | None,
     clearance: BaseClearance | None,
-) -> tuple[Costmap, Cells]:
+) -> tuple[queries.Costmap, Cells]:
     """Return the costmap of the search, and how many cells the maps in it exclude."""
-    world = require_world()
+    world = objects.require_world()
     origin = Pose((goal.position.x, goal.position.y, 0.0))
     ignored = {part for robot in robots for part in robot.with_load()}
-    free = OccupancyCostmap(world, origin, ignore=ignored) if clearance is None else clearance.costmap(origin)
-    costmap = free * GaussianCostmap(origin)
+    free = queries.OccupancyCostmap(world, origin, ignore=ignored) if clearance is None else clearance.costmap(origin)
+    costmap = free * queries.GaussianCostmap(origin)
     if viewer is None:
         return costmap, cells_of(free)
     low, high = viewer.camera_heights_m()
-    viewed = goal if isinstance(target, Pose) else in_world(target)
-    visible = VisibilityCostmap(world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored)
+    viewed = goal if isinstance(target, Pose) else objects.in_world(target)
+    visible = queries.VisibilityCostmap(
+        world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored
+    )
     return costmap * visible, cells_of(free, free * visible)
 
 
-def cells_of(free: Costmap, seeing: Costmap | None = None) -> Cells:
+def cells_of(free: queries.Costmap, seeing: queries.Costmap | None = None) -> Cells:
     """Count the cells of a map of free places; `seeing` leaves those from which the target is visible."""
     clear = int(np.count_nonzero(free.map))
     left = clear if seeing is None else int(np.count_nonzero(seeing.map))
     return Cells(free.map.size - clear, clear - left, left)
 
 
-def _goals(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
+def _goals(
+    robot: objects.CurrentRobot, base_pose: Pose, target: Pose | objects.ObjectLike, goal: Pose, arm: Arms
+) -> tuple[Pose, ...]:
     body, description = robot
     tool_frame = description.arms[arm].tool_frame
     tool = robot.tool_pose(arm)
     if not isinstance(target, Pose):
-        return pick_up_poses(goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
+        return geometry.pick_up_poses(goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
     held = next((each for each, link in body.attachments.items() if link == tool_frame), None)
-    tool_goal = place_pose(goal, held.pose, tool) if held is not None else goal
-    return tool_goal, retract(tool_goal)
+    tool_goal = geometry.place_pose(goal, held.pose, tool) if held is not None else goal
+    return tool_goal, geometry.retract(tool_goal)
 
 
-def _sees(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
+def _sees(robot: objects.CurrentRobot, base_pose: Pose, target: Pose | objects.ObjectLike, goal: Pose) -> bool:
     """Return whether the target is visible from the camera's position at this base pose."""
     eye = (base_pose @ robot.camera_pose().relative_to(robot.body.pose)).position
     if isinstance(target, Pose):
-        return require_world().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
-    return require_world().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN
+        return objects.require_world().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
+    return objects.require_world().visible(objects.in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN
 
 
 # === designators ==============================================================================================
@@ -388,7 +358,7 @@ class LocationDesignator(ABC):
 
         def __getattr__(self, name: str) -> NoReturn:
             if name in ("pose", "reachable_arms"):
-                raise NotResolved(type(self).__name__, name)
+                raise failures.NotResolved(type(self).__name__, name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
@@ -396,7 +366,7 @@ class LocationDesignator(ABC):
         """Yield every candidate in order; a refusal, or None, for one that is unsuitable; once `Cells` of costmaps."""
 
     @abstractmethod
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         """Return the plan failure for a search without a suitable place."""
 
     def _name(self) -> str:
@@ -455,7 +425,7 @@ class Location(LocationDesignator):
     def _candidates(self) -> Iterator[Location | Refusal]:
         yield self
 
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         raise AssertionError("a location always yields itself")
 
 
@@ -464,12 +434,12 @@ class ObjectRelativeLocation(LocationDesignator):
     """The place at `relative_pose` relative to an object. Raises `PerceptionObjectNotInWorld`."""
 
     relative_pose: Pose
-    reference_object: ObjectLike
+    reference_object: objects.ObjectLike
 
     def _candidates(self) -> Iterator[Location | Refusal]:
-        yield Location(pose_of(self.reference_object) @ self.relative_pose)
+        yield Location(objects.pose_of(self.reference_object) @ self.relative_pose)
 
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         raise AssertionError("a relative location always yields one place")
 
 
@@ -494,9 +464,9 @@ class CostmapLocation(LocationDesignator):
     `PerceptionObjectNotInWorld`.
     """
 
-    target: Pose | ObjectLike
-    reachable_for: ObjectLike | None = None
-    visible_for: ObjectLike | None = None
+    target: Pose | objects.ObjectLike
+    reachable_for: objects.ObjectLike | None = None
+    visible_for: objects.ObjectLike | None = None
     reachable_arm: Arms | None = None
 
     def _candidates(self) -> Iterator[Location | Refusal | Cells]:
@@ -510,13 +480,13 @@ class CostmapLocation(LocationDesignator):
             ),
         )
 
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         if self.reachable_for is None:
-            return LookingHighLevelFailure("there is no place to stand from which the target is visible")
+            return failures.LookingHighLevelFailure("there is no place to stand from which the target is visible")
         if isinstance(self.target, Pose):
-            return ReachabilityFailure(f"there is no place to stand and reach {self.target}", self.target)
+            return failures.ReachabilityFailure(f"there is no place to stand and reach {self.target}", self.target)
         name = self.target.name
-        return ObjectUnreachable(f"there is no place to stand and pick up {name}", name)
+        return failures.ObjectUnreachable(f"there is no place to stand and pick up {name}", name)
 
 
 @dataclass(frozen=True)
@@ -540,16 +510,16 @@ class AccessingLocation(LocationDesignator):
     `PerceptionObjectNotInWorld`, `CapabilityAbsenceFailure` and `UnknownLink`.
     """
 
-    handle: ObjectPart
-    robot: ObjectLike
+    handle: objects.ObjectPart
+    robot: objects.ObjectLike
     arm: Arms | None = None
 
     def _candidates(self) -> Iterator[Location | Refusal | Cells]:
         return map(_candidate, opening_poses(self.handle, self.robot, self.arm))
 
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         name = self.handle.name
-        return EnvironmentUnreachable(f"there is no place to stand and open and close {name}", name)
+        return failures.EnvironmentUnreachable(f"there is no place to stand and open and close {name}", name)
 
 
 @dataclass(frozen=True)
@@ -567,16 +537,18 @@ class SemanticCostmapLocation(LocationDesignator):
     """
 
     urdf_link_name: str
-    part_of: ObjectLike
-    for_object: ObjectLike | None = None
+    part_of: objects.ObjectLike
+    for_object: objects.ObjectLike | None = None
 
     def _candidates(self) -> Iterator[Location | Refusal]:
         for place in surface_poses(self.urdf_link_name, self.part_of, self.for_object):
             yield place if isinstance(place, Refusal) else Location(place)
 
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         name = self.for_object.name if self.for_object is not None else "anything"
-        return ObjectUnavailable(f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name)
+        return failures.ObjectUnavailable(
+            f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name
+        )
 
 
 def _candidate(searched: tuple[Pose, PlaceReach] | Cells) -> Location | Refusal | Cells:
@@ -607,14 +579,16 @@ _SWEEP_STEPS = 10
 """The steps of the joint at which the space that the drawer or door sweeps is computed."""
 
 
-def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
+def opening_poses(
+    part: objects.ObjectLike, robot: objects.ObjectLike, arm: Arms | None
+) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
     """Yield the cells of the costmaps, then base poses, best first, each with the arms that reach every goal or none.
 
     Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
     degrees; the places that it sweeps follow in the same order.
     """
-    handle, reacher = handle_of(part), resolve_robot(robot)
-    handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
+    handle, reacher = geometry.handle_of(part), resolve_robot(robot)
+    handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: geometry.closed_position(handle)})
     goals = _handle_goals(handle)
     clearance, height_m = base_clearance([reacher]), base_height_m(reacher)
     free, *costmaps = _costmaps(handle, handle_pose, reacher)
@@ -631,25 +605,25 @@ def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iter
                     yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
 
 
-def _handle_goals(handle: Handle) -> list[Pose]:
+def _handle_goals(handle: geometry.Handle) -> list[Pose]:
     """Return all goals of the tool frame; the ends of the path first, because most places fail at them."""
-    opened, closed, current = opened_position(handle), closed_position(handle), handle.position
-    path = hand_poses(handle, opened, closed)
+    opened, closed, current = geometry.opened_position(handle), geometry.closed_position(handle), handle.position
+    path = geometry.hand_poses(handle, opened, closed)
     between = [*path[1:-1]]
     ends = [path[0], path[-1]]
     if current not in (opened, closed):
-        from_current = hand_poses(handle, opened)
+        from_current = geometry.hand_poses(handle, opened)
         ends.append(from_current[0])
-        between += [*from_current[1:], *hand_poses(handle, closed)[1:]]
-    return [*ends, *(approach(each) for each in ends), *between]
+        between += [*from_current[1:], *geometry.hand_poses(handle, closed)[1:]]
+    return [*ends, *(geometry.approach(each) for each in ends), *between]
 
 
-def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> tuple[Costmap, ...]:
+def _costmaps(handle: geometry.Handle, handle_pose: Pose, robot: objects.CurrentRobot) -> tuple[queries.Costmap, ...]:
     """Return a map of free places, and two of those near the handle: the moving part does not sweep them, or does."""
     world, origin = handle.whole.world, Pose((handle_pose.position.x, handle_pose.position.y, 0.0))
-    near = GaussianCostmap(origin, sigma_cells=_SIGMA_CELLS, size_cells=_OPENING_CELLS, resolution_m=CELL_M)
+    near = queries.GaussianCostmap(origin, sigma_cells=_SIGMA_CELLS, size_cells=_OPENING_CELLS, resolution_m=CELL_M)
     free, unswept = (
-        OccupancyCostmap(
+        queries.OccupancyCostmap(
             world,
             origin,
             distance_to_obstacle_m=OPENING_CLEARANCE_M,
@@ -660,12 +634,12 @@ def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> tuple[C
         )
         for boxes in ((), list(_swept(handle)))
     )
-    return free, unswept * near, Costmap(free.map - unswept.map, origin, resolution_m=CELL_M) * near
+    return free, unswept * near, queries.Costmap(free.map - unswept.map, origin, resolution_m=CELL_M) * near
 
 
-def _swept(handle: Handle) -> Iterator[BoundingBox]:
+def _swept(handle: geometry.Handle) -> Iterator[BoundingBox]:
     """Yield the boxes that the links moved by the handle's joint occupy along its path."""
-    whole, opened, closed = handle.whole, opened_position(handle), closed_position(handle)
+    whole, opened, closed = handle.whole, geometry.opened_position(handle), geometry.closed_position(handle)
     moving = [link for link in whole.links if handle.joint in whole.joints_above(link)]
     for number in range(_SWEEP_STEPS + 1):
         at = {handle.joint: closed + (opened - closed) * number / _SWEEP_STEPS}
@@ -685,10 +659,10 @@ STEP_M = 0.02
 _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 
 
-def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Iterator[Pose | Refusal]:
+def surface_poses(link: str, whole: objects.ObjectLike, obj: objects.ObjectLike | None) -> Iterator[Pose | Refusal]:
     """Yield poses for `obj` on top of the link, with the link's heading, and refusals of occupied places."""
-    support = in_world(whole)
-    obj_to_put = in_world(obj) if obj is not None else None
+    support = objects.in_world(whole)
+    obj_to_put = objects.in_world(obj) if obj is not None else None
     heading = yaw_quaternion(support.link_pose(link).yaw)
     extent = _extent(obj_to_put, heading) if obj_to_put is not None else _POINT
     surface = support.bounding_box(link)
@@ -794,13 +768,13 @@ class DatabaseCostmapLocation:
     `PerceptionObjectNotInWorld`.
     """
 
-    target: ObjectLike
-    reachable_for: ObjectLike | None = None
+    target: objects.ObjectLike
+    reachable_for: objects.ObjectLike | None = None
     reachable_arm: Arms | None = None
     experience: Experience | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.target, Object | ObjectDesignator):
+        if not isinstance(self.target, Object | objects.ObjectDesignator):
             raise CallerError("experience is recorded by the type of an object: pass an object as target, not a place")
         check_properties(self)
         if self.reachable_arm is Arms.BOTH:
@@ -827,8 +801,10 @@ class DatabaseCostmapLocation:
                 " `async with Memory.open(url)`, or pass one as `experience`"
             )
         robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
-        height = pose_of(self.target).position.z - base_height_m(robot)
-        past = await source.successes(designator_of(self.target).object_type, arm=self.reachable_arm, height=height)
+        height = objects.pose_of(self.target).position.z - base_height_m(robot)
+        past = await source.successes(
+            objects.designator_of(self.target).object_type, arm=self.reachable_arm, height=height
+        )
         return _ExperienceLocation(self.target, self.reachable_for, self.reachable_arm, past)
 
 
@@ -854,8 +830,8 @@ class _PlaceIterator:
 class _ExperienceLocation(LocationDesignator):
     """The places of a `DatabaseCostmapLocation` after its experience has been queried."""
 
-    target: ObjectLike
-    reachable_for: ObjectLike | None
+    target: objects.ObjectLike
+    reachable_for: objects.ObjectLike | None
     reachable_arm: Arms | None
     past: Sequence[PastSuccess]
 
@@ -863,13 +839,17 @@ class _ExperienceLocation(LocationDesignator):
         return DatabaseCostmapLocation.__name__
 
     def _candidates(self) -> Iterator[Location | Refusal]:
-        target_pose = pose_of(self.target)
+        target_pose = objects.pose_of(self.target)
         robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
         origin = Pose((target_pose.position.x, target_pose.position.y, 0.0))
         ignored = robot.with_load() if robot is not None else None
         clearance = base_clearance([robot] if robot is not None else [])
-        free = OccupancyCostmap(
-            require_world(), origin, distance_to_obstacle_m=POLICY_CLEARANCE_M, size_cells=_POLICY_CELLS, ignore=ignored
+        free = queries.OccupancyCostmap(
+            objects.require_world(),
+            origin,
+            distance_to_obstacle_m=POLICY_CLEARANCE_M,
+            size_cells=_POLICY_CELLS,
+            ignore=ignored,
         )
         height_m, lifting = base_height_m(robot), self._lifting(robot)
         for each in self.past:
@@ -892,16 +872,16 @@ class _ExperienceLocation(LocationDesignator):
             else:
                 yield Location(base_pose, (each.arm,), each.grasp, each.torso_height)
 
-    def _lifting(self, robot: CurrentRobot | None) -> tuple[Arms, ...]:
+    def _lifting(self, robot: objects.CurrentRobot | None) -> tuple[Arms, ...]:
         """Return the arms of past successes to repeat: where the arm is open, those that lift the target."""
         used = dict.fromkeys(each.arm for each in self.past)
         if robot is None or self.reachable_arm is not None:
             return tuple(used)
-        return lifting_arms(robot, [*robot.description.arms, *used], self.target)
+        return geometry.lifting_arms(robot, [*robot.description.arms, *used], self.target)
 
-    def _no_place_failure(self) -> PlanFailure:
+    def _no_place_failure(self) -> failures.PlanFailure:
         name = self.target.name
-        return ObjectUnreachable(f"no past success is usable for {name} in this scene", name)
+        return failures.ObjectUnreachable(f"no past success is usable for {name} in this scene", name)
 
 
 def _upright_pose(base: Pose, height_m: float) -> Pose | None:
@@ -911,7 +891,7 @@ def _upright_pose(base: Pose, height_m: float) -> Pose | None:
     return Pose((base.position.x, base.position.y, height_m), yaw_quaternion(base.yaw), base.frame)
 
 
-def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> PlaceReach:
+def _reach(robot: objects.CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> PlaceReach:
     """Return the arm if it reaches all three goals of the grasp from the base pose at the past torso height."""
     body, description = robot
     if past.arm not in description.arms:
@@ -925,6 +905,6 @@ def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSu
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
         tool = robot.tool_pose(arm)
-        return pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
+        return geometry.pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
     return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height, grasps=True)

@@ -19,63 +19,14 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, ClassVar, Literal, Protocol, Self, TypeAlias
 
+from pycrorm_async.plan import failures, geometry, objects
 from pycrorm_async.plan.execution import Seen, recorder
-from pycrorm_async.plan.failures import (
-    NOTHING,
-    CapabilityAbsenceFailure,
-    ConfigurationNotReached,
-    EnvironmentManipulationImpossible,
-    IKError,
-    IllPosedGoalFailure,
-    ManipulationGoalInCollision,
-    NavigationGoalInCollision,
-    NoRobotChosen,
-    PerceptionObjectNotFound,
-    ResolutionError,
-    Resource,
-    TorsoGoalUnreachable,
-    arms,
-    moving,
-    reaching,
-    reaching_for,
-)
-from pycrorm_async.plan.geometry import (
-    HOLD_DISTANCE_M_MAX,
-    Handle,
-    check_same_world,
-    closed_position,
-    distance_to_box,
-    handle_of,
-    handle_poses,
-    moved_position,
-    opened_position,
-)
 from pycrorm_async.plan.language import BaseMotion
-from pycrorm_async.plan.objects import (
-    CurrentRobot,
-    ObjectDesignator,
-    ObjectPart,
-    check_in_map,
-    designator_of,
-    require_robot,
-    require_world,
-)
 from pycrorm_async.plan.task import Performable, current_node
+from pycrorm_async.world import pose as poses
 from pycrorm_async.world.arms import Chain
 from pycrorm_async.world.bullet import Object, current_world
 from pycrorm_async.world.kinematics import Unreachable, solve
-from pycrorm_async.world.pose import (
-    Arms,
-    GripperState,
-    JointFollows,
-    JointLimitExceeded,
-    ObjectType,
-    Pose,
-    UnknownJoint,
-    Vector,
-    dot,
-    rotated,
-)
 from pycrorm_async.world.queries import collisions_at
 from pycrorm_async.world.urdf import Drive, FieldOfView, Limits, PR2Description
 from pycrorm_async.world.world_copy import acting_robot
@@ -94,7 +45,7 @@ _TURN_MIN_RAD = 1e-9
 """The largest turn in rad of a round at which the iteration ends."""
 
 
-def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:
+def head_joints(robot: objects.CurrentRobot, target: poses.Pose) -> dict[str, float]:
     """Return joint positions (rad) that point the camera's axis at the target, clamped to the joints' limits.
 
     Raises `CapabilityAbsenceFailure` if the robot has no camera, or no joint that turns it.
@@ -106,7 +57,7 @@ def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:
     return _turned(robot, target)
 
 
-def _pan_and_tilt(robot: CurrentRobot, description: PR2Description, target: Pose) -> dict[str, float]:
+def _pan_and_tilt(robot: objects.CurrentRobot, description: PR2Description, target: poses.Pose) -> dict[str, float]:
     """Pan about z of the pan link, tilt about y of the tilt link.
 
     The origin of the tilt link moves with pan, so tilt is computed for the head after panning.
@@ -125,7 +76,7 @@ def _pan_and_tilt(robot: CurrentRobot, description: PR2Description, target: Pose
     }
 
 
-def _turned(robot: CurrentRobot, target: Pose) -> dict[str, float]:
+def _turned(robot: objects.CurrentRobot, target: poses.Pose) -> dict[str, float]:
     body, description = robot
     if description.camera_link is None:
         raise robot.absence("camera")
@@ -142,7 +93,9 @@ def _turned(robot: CurrentRobot, target: Pose) -> dict[str, float]:
         for joint in description.head_joints:
             camera = head.forward(positions)
             towards = [to - at for to, at in zip(point, camera.position, strict=True)]
-            turn = _angle_about(head.axes(positions)[joint], rotated(camera.orientation, (0.0, 0.0, 1.0)), towards)
+            turn = _angle_about(
+                head.axes(positions)[joint], poses.rotated(camera.orientation, (0.0, 0.0, 1.0)), towards
+            )
             before = positions[joint]
             positions[joint] = _clamp(before + turn, body.joint_limits(joint))
             largest = max(largest, abs(positions[joint] - before))
@@ -151,12 +104,12 @@ def _turned(robot: CurrentRobot, target: Pose) -> dict[str, float]:
     return {joint: positions[joint] for joint in description.head_joints}
 
 
-def _angle_about(axis: Vector, one: Sequence[float], other: Sequence[float]) -> float:
+def _angle_about(axis: poses.Vector, one: Sequence[float], other: Sequence[float]) -> float:
     """Return the angle about the axis from one direction to the other, -π to π."""
     (ax, ay, az), (x, y, z) = axis, one
-    along_one, along_other = dot(axis, one), dot(axis, other)
+    along_one, along_other = poses.dot(axis, one), poses.dot(axis, other)
     across = (ay * z - az * y, az * x - ax * z, ax * y - ay * x)
-    return math.atan2(dot(across, other), dot(one, other) - along_one * along_other)
+    return math.atan2(poses.dot(across, other), poses.dot(one, other) - along_one * along_other)
 
 
 def _clamp(value: float, limits: tuple[float, float]) -> float:
@@ -172,10 +125,10 @@ class MoveMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "Navigating"
 
-    target: Pose
+    target: poses.Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.BASE})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.BASE})
 
     async def perform(self) -> None:
         await execute(self, "navigate")
@@ -195,17 +148,17 @@ class MoveTCPMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "AssumingArmPose"
 
-    target: Pose
-    arm: Arms
+    target: poses.Pose
+    arm: poses.Arms
     allow_gripper_collision: bool | None = None
     _object_name: str | None = field(default=None, repr=False, compare=False)
     """The object for which the arm reaches; not recorded with the motion, but with its failure."""
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        with reaching_for(self._object_name):
+        with failures.reaching_for(self._object_name):
             await execute(self, "move_tcp")
 
 
@@ -215,10 +168,10 @@ class LookingMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "LookingAt"
 
-    target: Pose
+    target: poses.Pose
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.HEAD})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.HEAD})
 
     async def perform(self) -> None:
         await execute(self, "looking")
@@ -230,12 +183,12 @@ class MoveGripperMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "SettingGripper"
 
-    motion: GripperState
-    gripper: Arms
+    motion: poses.GripperState
+    gripper: poses.Arms
     allow_gripper_collision: bool | None = None
 
-    def resources(self) -> frozenset[Resource]:
-        return arms(self.gripper)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.arms(self.gripper)
 
     async def perform(self) -> None:
         await execute(self, "move_gripper")
@@ -253,9 +206,9 @@ class MoveArmJointsMotion(BaseMotion):
     left_arm_poses: dict[str, float] | None = None
     right_arm_poses: dict[str, float] | None = None
 
-    def resources(self) -> frozenset[Resource]:
-        left = arms(Arms.LEFT) if self.left_arm_poses else NOTHING
-        return left | arms(Arms.RIGHT) if self.right_arm_poses else left
+    def resources(self) -> frozenset[failures.Resource]:
+        left = failures.arms(poses.Arms.LEFT) if self.left_arm_poses else failures.NOTHING
+        return left | failures.arms(poses.Arms.RIGHT) if self.right_arm_poses else left
 
     async def perform(self) -> None:
         await execute(self, "move_arm_joints")
@@ -280,15 +233,17 @@ class MoveJointsMotion(BaseMotion):
         super().__post_init__()
         if len(self.names) != len(self.positions):
             counts = f"expected {len(self.names)} values, one for each name, got {len(self.positions)}"
-            raise ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
+            raise failures.ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
         if duplicates := {name for name in self.names if self.names.count(name) > 1}:
-            raise ResolutionError(type(self).__name__, wrong=[f"names: {', '.join(sorted(duplicates))} more than once"])
+            raise failures.ResolutionError(
+                type(self).__name__, wrong=[f"names: {', '.join(sorted(duplicates))} more than once"]
+            )
 
-    def resources(self) -> frozenset[Resource]:
+    def resources(self) -> frozenset[failures.Resource]:
         world = current_world.get()
         robot = acting_robot(world) if world is not None else None
         description = robot.robot_description if robot is not None else None
-        return moving(self.names, description) if description is not None else NOTHING
+        return failures.moving(self.names, description) if description is not None else failures.NOTHING
 
     async def perform(self) -> None:
         await execute(self, "move_joints")
@@ -303,12 +258,12 @@ class DetectingMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "LookingFor"
 
-    object_type: ObjectType
+    object_type: poses.ObjectType
 
-    def resources(self) -> frozenset[Resource]:
-        return frozenset({Resource.HEAD})
+    def resources(self) -> frozenset[failures.Resource]:
+        return frozenset({failures.Resource.HEAD})
 
-    async def perform(self) -> ObjectDesignator:
+    async def perform(self) -> objects.ObjectDesignator:
         looking = execute(self, "detecting")
         return await report_perception(looking, source="camera", object_type=self.object_type)
 
@@ -319,9 +274,9 @@ class WorldStateDetectingMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "CheckingObjectPresence"
 
-    object_type: ObjectType
+    object_type: poses.ObjectType
 
-    async def perform(self) -> ObjectDesignator:
+    async def perform(self) -> objects.ObjectDesignator:
         asking = execute(self, "world_state_detecting")
         return await report_perception(asking, source="world_state", object_type=self.object_type)
 
@@ -338,14 +293,14 @@ class OpeningMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "Opening"
 
-    object_part: ObjectPart
-    arm: Arms
+    object_part: objects.ObjectPart
+    arm: poses.Arms
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        with reaching_for(self.object_part.name):
+        with failures.reaching_for(self.object_part.name):
             await execute(self, "open")
 
 
@@ -355,14 +310,14 @@ class ClosingMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "Closing"
 
-    object_part: ObjectPart
-    arm: Arms
+    object_part: objects.ObjectPart
+    arm: poses.Arms
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        with reaching_for(self.object_part.name):
+        with failures.reaching_for(self.object_part.name):
             await execute(self, "close")
 
 
@@ -382,18 +337,18 @@ class AccessingMotion(BaseMotion):
 
     concept: ClassVar[str | None] = "Accessing"
 
-    part_of: ObjectDesignator | Object
-    arm: Arms
+    part_of: objects.ObjectDesignator | Object
+    arm: poses.Arms
     gripper: str
     drawer_joint: str
     drawer_handle: str
     distance: float
 
-    def resources(self) -> frozenset[Resource]:
-        return reaching(self.arm)
+    def resources(self) -> frozenset[failures.Resource]:
+        return failures.reaching(self.arm)
 
     async def perform(self) -> None:
-        with reaching_for(self.drawer_handle):
+        with failures.reaching_for(self.drawer_handle):
             await execute(self, "accessing")
 
 
@@ -411,8 +366,8 @@ SEEN_SHARE_MIN = 0.8
 
 
 async def report_perception(
-    looking: Awaitable[Sequence[Seen]], *, source: Source, object_type: ObjectType
-) -> ObjectDesignator:
+    looking: Awaitable[Sequence[Seen]], *, source: Source, object_type: poses.ObjectType
+) -> objects.ObjectDesignator:
     """Report a perception to the observer, also an empty one, and return the designator of the first percept.
 
     That is the designator of the world object that it matches, with the object's pose in the world, or a
@@ -424,16 +379,16 @@ async def report_perception(
     seen: tuple[Seen, ...] = ()
     try:
         seen = tuple(await looking)
-    except PerceptionObjectNotFound:
+    except failures.PerceptionObjectNotFound:
         _notify(source, object_type, seen)
         raise
     _notify(source, object_type, seen)
     if not seen:
-        raise PerceptionObjectNotFound(f"no {object_type.name} was perceived", object_type)
-    return designator_of(seen[0].thing)
+        raise failures.PerceptionObjectNotFound(f"no {object_type.name} was perceived", object_type)
+    return objects.designator_of(seen[0].thing)
 
 
-def seen_by_camera(robot: CurrentRobot, object_type: ObjectType) -> tuple[Seen, ...]:
+def seen_by_camera(robot: objects.CurrentRobot, object_type: poses.ObjectType) -> tuple[Seen, ...]:
     """Return the objects of that type that the head's camera perceives, the most visible first.
 
     The robot itself and the objects it carries do not occlude.
@@ -444,7 +399,7 @@ def seen_by_camera(robot: CurrentRobot, object_type: ObjectType) -> tuple[Seen, 
     camera = robot.camera_pose()
     seen: list[Seen] = []
     unseen: dict[str, str] = {}
-    for obj in require_world().objects:
+    for obj in objects.require_world().objects:
         if obj.object_type is not object_type or obj is robot.body:
             continue
         share, reason = _visibility(robot, camera, obj)
@@ -455,31 +410,31 @@ def seen_by_camera(robot: CurrentRobot, object_type: ObjectType) -> tuple[Seen, 
     if not seen:
         reasons = "; ".join(f"{name} {reason}" for name, reason in unseen.items())
         count = f"{len(unseen)} in the world: {reasons}" if unseen else "there is none in the world"
-        raise PerceptionObjectNotFound(f"no {object_type.name} is seen; {count}", object_type, unseen)
+        raise failures.PerceptionObjectNotFound(f"no {object_type.name} is seen; {count}", object_type, unseen)
     return tuple(sorted(seen, key=lambda each: -(each.visible or 0.0)))
 
 
-def objects_in_world(object_type: ObjectType) -> tuple[Seen, ...]:
+def objects_in_world(object_type: poses.ObjectType) -> tuple[Seen, ...]:
     """Return the world's objects of that type in the order of their creation. Raises `PerceptionObjectNotFound`."""
-    detections = tuple(Seen(obj) for obj in require_world().objects if obj.object_type is object_type)
+    detections = tuple(Seen(obj) for obj in objects.require_world().objects if obj.object_type is object_type)
     if not detections:
-        raise PerceptionObjectNotFound(f"there is no {object_type.name} in the world", object_type)
+        raise failures.PerceptionObjectNotFound(f"there is no {object_type.name} in the world", object_type)
     return detections
 
 
-def in_field_of_view(camera: Pose, view: FieldOfView, point: Sequence[float]) -> bool:
+def in_field_of_view(camera: poses.Pose, view: FieldOfView, point: Sequence[float]) -> bool:
     """Return whether the point (m, map) is in the image of a camera whose optical frame is at that pose."""
-    x, y, z = Pose(point).relative_to(camera).position
+    x, y, z = poses.Pose(point).relative_to(camera).position
     return abs(math.atan2(x, z)) <= view.horizontal / 2 and abs(math.atan2(y, z)) <= view.vertical / 2
 
 
-def _notify(source: Source, object_type: ObjectType, seen: tuple[Seen, ...]) -> None:
+def _notify(source: Source, object_type: poses.ObjectType, seen: tuple[Seen, ...]) -> None:
     observer = recorder.get()
     if observer is not None:
         observer.object_detected(source=source, object_type=object_type, seen=seen, node=current_node.get())
 
 
-def _visibility(robot: CurrentRobot, camera: Pose, obj: Object) -> tuple[float, str | None]:
+def _visibility(robot: objects.CurrentRobot, camera: poses.Pose, obj: Object) -> tuple[float, str | None]:
     """Return the object's visible share, and the reason why it is not perceived, or None if it is."""
     if not in_field_of_view(camera, robot.description.camera_view_rad, obj.bounding_box().centre):
         return 0.0, "is outside the camera's field of view"
@@ -510,13 +465,13 @@ def execute(motion: Performable, module: str) -> Awaitable[Any]:
     """
     chosen = _chosen.get()
     if not chosen:
-        raise NoRobotChosen(type(motion).__name__)
+        raise failures.NoRobotChosen(type(motion).__name__)
     robot = chosen[-1]
     method = getattr(robot.modules, module, None)
     if method is None:
         name = type(motion).__name__
         message = f"the {robot.name} robot cannot do {name}: {type(robot.modules).__name__} has no method {module!r}"
-        raise CapabilityAbsenceFailure(message, robot.name, name)
+        raise failures.CapabilityAbsenceFailure(message, robot.name, name)
     executing: Awaitable[Any] = method(motion)
     return executing
 
@@ -554,7 +509,7 @@ class SimulatedModules:
         self._collisions = collisions
 
     async def navigate(self, motion: MoveMotion) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         if robot.description.drive is Drive.FIXED:
             raise robot.absence("drive: its base is fixed")
         if self._collisions:
@@ -562,100 +517,100 @@ class SimulatedModules:
         robot.body.set_pose(motion.target)
 
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         joints = self._solve(robot, motion.arm, motion.target)
         if self._collisions:
             self._check_clear(robot, motion, joints)
         robot.body.set_joint_positions(joints)
 
     async def looking(self, motion: LookingMotion) -> None:
-        robot = require_robot()
-        check_in_map(motion.target)
+        robot = objects.require_robot()
+        objects.check_in_map(motion.target)
         robot.body.set_joint_positions(head_joints(robot, motion.target))
 
     async def move_gripper(self, motion: MoveGripperMotion) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         joints: dict[str, float] = {}
         for arm in robot.each_arm(motion.gripper):
             joints |= robot.gripper_joints(arm, motion.motion)
         robot.body.set_joint_positions(joints)
 
     async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         targets: dict[str, float] = {}
-        for arm, positions in ((Arms.LEFT, motion.left_arm_poses), (Arms.RIGHT, motion.right_arm_poses)):
+        for arm, positions in ((poses.Arms.LEFT, motion.left_arm_poses), (poses.Arms.RIGHT, motion.right_arm_poses)):
             for joint in positions or {}:
                 if joint not in (joints := robot.one_arm(arm).joints):
-                    raise UnknownJoint(f"{robot.body.name}, {arm.name} arm", joint, joints)
+                    raise poses.UnknownJoint(f"{robot.body.name}, {arm.name} arm", joint, joints)
             targets |= positions or {}
         _set_joints(robot, targets)
 
     async def move_joints(self, motion: MoveJointsMotion) -> None:
-        _set_joints(require_robot(), dict(zip(motion.names, motion.positions, strict=True)))
+        _set_joints(objects.require_robot(), dict(zip(motion.names, motion.positions, strict=True)))
 
     async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]:
-        return seen_by_camera(require_robot(), motion.object_type)
+        return seen_by_camera(objects.require_robot(), motion.object_type)
 
     async def world_state_detecting(self, motion: WorldStateDetectingMotion) -> Sequence[Seen]:
         return objects_in_world(motion.object_type)
 
     async def open(self, motion: OpeningMotion) -> None:
-        handle = handle_of(motion.object_part)
-        self._move_handle(require_robot(), motion.arm, handle, opened_position(handle))
+        handle = geometry.handle_of(motion.object_part)
+        self._move_handle(objects.require_robot(), motion.arm, handle, geometry.opened_position(handle))
 
     async def close(self, motion: ClosingMotion) -> None:
-        handle = handle_of(motion.object_part)
-        self._move_handle(require_robot(), motion.arm, handle, closed_position(handle))
+        handle = geometry.handle_of(motion.object_part)
+        self._move_handle(objects.require_robot(), motion.arm, handle, geometry.closed_position(handle))
 
     async def accessing(self, motion: AccessingMotion) -> None:
-        robot = require_robot()
+        robot = objects.require_robot()
         tool_frame = robot.one_arm(motion.arm).tool_frame
         if motion.gripper != tool_frame:
             message = f"the gripper of the {motion.arm.name} arm is {tool_frame}, not {motion.gripper}"
-            raise IllPosedGoalFailure(message, motion.gripper)
-        handle = handle_of(ObjectPart(motion.drawer_handle, motion.part_of), motion.drawer_joint)
-        self._move_handle(robot, motion.arm, handle, moved_position(handle, motion.distance))
+            raise failures.IllPosedGoalFailure(message, motion.gripper)
+        handle = geometry.handle_of(objects.ObjectPart(motion.drawer_handle, motion.part_of), motion.drawer_joint)
+        self._move_handle(robot, motion.arm, handle, geometry.moved_position(handle, motion.distance))
 
-    def _move_handle(self, robot: CurrentRobot, arm: Arms, handle: Handle, goal: float) -> None:
+    def _move_handle(self, robot: objects.CurrentRobot, arm: poses.Arms, handle: geometry.Handle, goal: float) -> None:
         """Move the handle's joint to `goal` together with the hand, which keeps its pose relative to the handle."""
-        check_same_world(robot, handle.whole)
+        geometry.check_same_world(robot, handle.whole)
         tool_frame = robot.one_arm(arm).tool_frame
         tool = robot.tool_pose(arm)
-        distance = distance_to_box(tool, handle.whole.bounding_box(handle.link))
-        if distance > HOLD_DISTANCE_M_MAX:
+        distance = geometry.distance_to_box(tool, handle.whole.bounding_box(handle.link))
+        if distance > geometry.HOLD_DISTANCE_M_MAX:
             message = f"{tool_frame} is not on {handle.link} but {distance:.3f} m away: grasp it first"
-            raise EnvironmentManipulationImpossible(message, handle.link, distance)
+            raise failures.EnvironmentManipulationImpossible(message, handle.link, distance)
         grip = tool.relative_to(handle.whole.link_pose(handle.link))
-        path = [self._solve(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
+        path = [self._solve(robot, arm, each @ grip) for each in geometry.handle_poses(handle, goal)]
         robot.body.set_joint_positions(path[-1])
         handle.whole.set_joint_position(handle.joint, goal)
 
-    def _solve(self, robot: CurrentRobot, arm: Arms, target: Pose) -> dict[str, float]:
+    def _solve(self, robot: objects.CurrentRobot, arm: poses.Arms, target: poses.Pose) -> dict[str, float]:
         """Return the arm's joint angles for a tool frame at the target. Raises `IKError`."""
         tool_frame = robot.one_arm(arm).tool_frame
         try:
             return solve(robot.body, arm, target, limits=self._limits)
         except Unreachable as unreachable:
-            raise IKError(target, arm, tool_frame, unreachable.reason) from unreachable
+            raise failures.IKError(target, arm, tool_frame, unreachable.reason) from unreachable
 
-    def _check_clear(self, robot: CurrentRobot, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
+    def _check_clear(self, robot: objects.CurrentRobot, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
         """Raise `ManipulationGoalInCollision` if the arm or the held object collides at these joint angles."""
         held = [obj for obj, link in robot.body.attachments.items() if link == robot.one_arm(motion.arm).tool_frame]
         may_touch = bool(motion.allow_gripper_collision)
         if (collision := arm_collision(robot, motion.arm, joints, gripper_may_touch=may_touch, held=held)) is not None:
             part, obj = collision
             message = f"at its goal the {motion.arm.name} arm would be in {obj.name} with {part}"
-            raise ManipulationGoalInCollision(message, part, obj.name)
+            raise failures.ManipulationGoalInCollision(message, part, obj.name)
 
 
 def arm_collision(
-    robot: CurrentRobot,
-    arm: Arms,
+    robot: objects.CurrentRobot,
+    arm: poses.Arms,
     joints: Mapping[str, float],
     *,
     gripper_may_touch: bool,
     held: Sequence[Object] = (),
-    base: Pose | None = None,
+    base: poses.Pose | None = None,
 ) -> tuple[str, Object] | None:
     """Return the first link of an arm, or held object, that would be in another object, and that object.
 
@@ -668,26 +623,26 @@ def arm_collision(
     return next(iter(collisions_at(body, joints, links=links, carried=held, base=base)), None)
 
 
-def _check_base_clear(robot: CurrentRobot, goal: Pose) -> None:
+def _check_base_clear(robot: objects.CurrentRobot, goal: poses.Pose) -> None:
     """Raise `NavigationGoalInCollision` if the base, the torso or the head collides at this pose of the base."""
-    check_in_map(goal)
+    objects.check_in_map(goal)
     links = robot.base_links()
     carried = [obj for obj, link in robot.body.attachments.items() if (link or robot.body.body.base) in links]
     collisions = collisions_at(robot.body, {}, links=links, carried=carried, base=goal)
     if collisions:
         part, obj = collisions[0]
         message = f"at its goal the base would be in {obj.name} with {part}"
-        raise NavigationGoalInCollision(message, part, obj.name)
+        raise failures.NavigationGoalInCollision(message, part, obj.name)
 
 
-def _set_joints(robot: CurrentRobot, positions: Mapping[str, float]) -> None:
+def _set_joints(robot: objects.CurrentRobot, positions: Mapping[str, float]) -> None:
     body, description = robot
     try:
         body.set_joint_positions(positions)
-    except (JointLimitExceeded, JointFollows) as exceeded:
+    except (poses.JointLimitExceeded, poses.JointFollows) as exceeded:
         if description.torso_joint is not None and [*positions] == [description.torso_joint]:
-            raise TorsoGoalUnreachable(str(exceeded), positions[description.torso_joint]) from exceeded
-        raise ConfigurationNotReached(str(exceeded), dict(positions)) from exceeded
+            raise failures.TorsoGoalUnreachable(str(exceeded), positions[description.torso_joint]) from exceeded
+        raise failures.ConfigurationNotReached(str(exceeded), dict(positions)) from exceeded
 
 
 # === process modules ==========================================================================================

@@ -21,15 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeAlias
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan.failures import (
-    CapabilityAbsenceFailure,
-    IllPosedGoalFailure,
-    NoRobotHere,
-    NotResolved,
-    ObjectNotFound,
-    PerceptionObjectNotInWorld,
-    ResolutionError,
-)
+from pycrorm_async.plan import failures
 from pycrorm_async.world.bullet import Object, current_world
 from pycrorm_async.world.pose import Arms, GripperState, NoWorld, ObjectType, Pose
 from pycrorm_async.world.urdf import ArmDescription, RobotDescription
@@ -65,7 +57,7 @@ class ObjectDesignator:
     def __post_init__(self) -> None:
         _check(self, name=str, object_type=ObjectType)
         if self.world_object is None and self.frozen_pose is None:
-            raise ResolutionError(type(self).__name__, missing=["world_object or frozen_pose"])
+            raise failures.ResolutionError(type(self).__name__, missing=["world_object or frozen_pose"])
         if self.frozen_pose is not None:
             _check(self, frozen_pose=Pose)
 
@@ -185,7 +177,9 @@ class LocatedObject(ObjectDesignator):
         put(self, "timestamp", moment)
         _check(self, name=str, object_type=ObjectType, relative_pose=Pose, timestamp=datetime)
         if moment.tzinfo is None:
-            raise ResolutionError(type(self).__name__, wrong=["timestamp: expected a datetime with a time zone"])
+            raise failures.ResolutionError(
+                type(self).__name__, wrong=["timestamp: expected a datetime with a time zone"]
+            )
 
     @property
     def pose(self) -> Pose:
@@ -235,7 +229,7 @@ class ObjectDesignatorDescription:
 
         def __getattr__(self, name: str) -> NoReturn:
             if name in ("name", "object_type", "pose", "world_object"):
-                raise NotResolved(type(self).__name__, name)
+                raise failures.NotResolved(type(self).__name__, name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def resolve(self) -> ObjectDesignator:
@@ -243,7 +237,7 @@ class ObjectDesignatorDescription:
         for designator in self:
             return designator
         present = ", ".join(each.name for each in require_world().objects) or "nothing"
-        raise ObjectNotFound(f"no object is {self}; in the world: {present}", self.names, self._type_names())
+        raise failures.ObjectNotFound(f"no object is {self}; in the world: {present}", self.names, self._type_names())
 
     def __str__(self) -> str:
         parts = []
@@ -264,7 +258,7 @@ def _as_tuple(name: str, kind: type[T], values: T | Iterable[T] | None) -> tuple
     items = tuple(values) if isinstance(values, Iterable) and not isinstance(values, kind) else (values,)
     if wrong := [each for each in items if not isinstance(each, kind)]:
         fault = f"{name}: expected each {kind.__name__}, got {wrong[0]!r}"
-        raise ResolutionError(ObjectDesignatorDescription.__name__, wrong=[fault])
+        raise failures.ResolutionError(ObjectDesignatorDescription.__name__, wrong=[fault])
     return items
 
 
@@ -317,7 +311,9 @@ def designator_of(target: ObjectLike) -> ObjectDesignator:
     if isinstance(target, ObjectDesignator):
         return target
     if not isinstance(target, Object):
-        raise ResolutionError("ObjectDesignator", wrong=[f"expected an object or its designator, got {target!r}"])
+        raise failures.ResolutionError(
+            "ObjectDesignator", wrong=[f"expected an object or its designator, got {target!r}"]
+        )
     return ObjectDesignator(target.name, target.object_type, target)
 
 
@@ -345,7 +341,7 @@ def in_world(target: ObjectLike) -> Object:
     obj = target.world_object if isinstance(target, ObjectDesignator) else target
     match = counterpart(obj, _current_world_of(obj)) if obj is not None else None
     if match is None:
-        raise PerceptionObjectNotInWorld(f"{target.name} is not an object of the world", target.name)
+        raise failures.PerceptionObjectNotInWorld(f"{target.name} is not an object of the world", target.name)
     return match
 
 
@@ -371,7 +367,7 @@ def _check(designator: ObjectDesignator, **expected: type) -> None:
         if not isinstance(value := getattr(designator, name), kind)
     ]
     if wrong:
-        raise ResolutionError(type(designator).__name__, wrong=wrong)
+        raise failures.ResolutionError(type(designator).__name__, wrong=wrong)
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -404,10 +400,12 @@ class CurrentRobot(NamedTuple):
             CapabilityAbsenceFailure: the robot has no such arm.
         """
         if arm is Arms.BOTH:
-            raise IllPosedGoalFailure("this designator needs one arm, LEFT or RIGHT, and does not work with BOTH", arm)
+            raise failures.IllPosedGoalFailure(
+                "this designator needs one arm, LEFT or RIGHT, and does not work with BOTH", arm
+            )
         arm_description = self.description.arms.get(arm)
         if arm_description is None:
-            raise CapabilityAbsenceFailure(f"{self.body.name} has no {arm.name} arm", self.body.name, arm)
+            raise failures.CapabilityAbsenceFailure(f"{self.body.name} has no {arm.name} arm", self.body.name, arm)
         return arm_description
 
     def each_arm(self, arm: Arms) -> dict[Arms, ArmDescription]:
@@ -422,9 +420,9 @@ class CurrentRobot(NamedTuple):
             link for link in body.links if body.body.solids[link] and first_joints.isdisjoint(body.joints_above(link))
         )
 
-    def absence(self, capability: str) -> CapabilityAbsenceFailure:
+    def absence(self, capability: str) -> failures.CapabilityAbsenceFailure:
         """Return the failure of an action for which the robot lacks a part."""
-        return CapabilityAbsenceFailure(f"{self.body.name} has no {capability}", self.body.name, capability)
+        return failures.CapabilityAbsenceFailure(f"{self.body.name} has no {capability}", self.body.name, capability)
 
     def torso_joint(self) -> str:
         """Return the joint that lifts the torso. Raises `CapabilityAbsenceFailure`."""
@@ -488,11 +486,11 @@ def require_robot() -> CurrentRobot:
     body = acting_robot(world)
     if body is None:
         if world.robot is not None:
-            raise NoRobotHere("the robot that acts here (robot_acting) is not in the current world")
-        raise NoRobotHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
+            raise failures.NoRobotHere("the robot that acts here (robot_acting) is not in the current world")
+        raise failures.NoRobotHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
     description = body.robot_description
     if description is None:
-        raise NoRobotHere(
+        raise failures.NoRobotHere(
             f"no robot description is registered for the robot {body.name!r}: pass one, as in Object(..., robot=PR2)"
         )
     return CurrentRobot(body, description)

@@ -15,19 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Column,
-    Double,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    PrimaryKeyConstraint,
-    Table,
-    Text,
-)
+import sqlalchemy as sa
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.types import TypeEngine
 
@@ -423,7 +411,7 @@ MARKED: Final = "marked"
 """The entry of a table's `info` that is True if its column `simulated` marks simulations, and is no field of a type."""
 
 
-def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
+def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> sa.Table:
     """Return the table with its key and its indexes, in one generation.
 
     `stored` maps a column of the layout to its name in this database; the table's column keys are those of the layout.
@@ -435,15 +423,15 @@ def make_table(name: str, columns: dict[str, Storage], generation: int, stored: 
 @lru_cache(maxsize=512)
 def _make_table(
     name: str, items: tuple[tuple[str, Storage], ...], generation: int, stored: Callable[[str], str]
-) -> Table:
+) -> sa.Table:
     columns = dict(items)
-    table = Table(
+    table = sa.Table(
         physical_name(name, generation),
-        MetaData(),
+        sa.MetaData(),
         *(
-            Column(
+            sa.Column(
                 stored(column),
-                Text() if storage == "key" and column in _TEXT_KEYS else column_type(storage),
+                sa.Text() if storage == "key" and column in _TEXT_KEYS else column_type(storage),
                 nullable=storage != "key",
                 autoincrement=False,
                 key=column,
@@ -457,13 +445,13 @@ def _make_table(
     for column in indexed(name, columns):
         keys = [table.c[each] for each in (column, *_FURTHER.get((name, column), ()))]
         if further := [table.c[each] for each in _FURTHER_ON_POSTGRESQL.get((name, column), ())]:
-            Index(index_name(name, column, generation), *keys, info={"dialect": "sqlite"})
-            Index(index_name(name, column, generation), *keys, *further, info={"dialect": "postgresql"})
+            sa.Index(index_name(name, column, generation), *keys, info={"dialect": "sqlite"})
+            sa.Index(index_name(name, column, generation), *keys, *further, info={"dialect": "postgresql"})
         else:
-            Index(index_name(name, column, generation), *keys)
+            sa.Index(index_name(name, column, generation), *keys)
     if name == "task_tree_node":
         dtype, key_columns, included = _PICK_UPS
-        Index(
+        sa.Index(
             index_name(name, "pick_up", generation),
             *(table.c[each] for each in key_columns),
             postgresql_include=included,
@@ -473,12 +461,12 @@ def _make_table(
     return table
 
 
-def columns_in_order(table: Table) -> list[Column[Any]]:
+def columns_in_order(table: sa.Table) -> list[sa.Column[Any]]:
     """Return the columns in the order of the layout, which is that of the views; the table has the widest first."""
     return [table.c[each] for each in table.info[_ORDER]]
 
 
-class _Key(PrimaryKeyConstraint):
+class _Key(sa.PrimaryKeyConstraint):
     """A primary key that on PostgreSQL also has the episode, behind the id. On SQLite a single key is the rowid."""
 
 
@@ -508,19 +496,19 @@ def column_type(storage: Storage) -> TypeEngine[Any]:
     """Return the column type. On SQLite only a key declared INTEGER becomes the rowid."""
     match storage:
         case "key":
-            return BigInteger().with_variant(Integer(), "sqlite")
+            return sa.BigInteger().with_variant(sa.Integer(), "sqlite")
         case "row" | "pose" | "object" | "integer" | "time":
-            return BigInteger()
+            return sa.BigInteger()
         case "number":
-            return Integer()
+            return sa.Integer()
         case "real":
-            return Double()
+            return sa.Double()
         case "boolean":
-            return Boolean()
+            return sa.Boolean()
         case "text" | "json":
-            return Text()
+            return sa.Text()
         case "bytes":
-            return LargeBinary()
+            return sa.LargeBinary()
 
 
 # === union ====================================================================================================

@@ -21,30 +21,8 @@ from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Final, Protocol, Self, TypeVar
 
-from sqlalchemy import (
-    Boolean,
-    ColumnElement,
-    Double,
-    FromClause,
-    ScalarSelect,
-    Select,
-    Subquery,
-    Table,
-    Text,
-    TextualSelect,
-    and_,
-    case,
-    cast,
-    column,
-    exists,
-    func,
-    literal,
-    literal_column,
-    null,
-    select,
-    text,
-    union_all,
-)
+import sqlalchemy as sa
+from sqlalchemy import text
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
@@ -69,39 +47,41 @@ from pycrorm_async.world.pose import ObjectType
 _POSE = "x y z qx qy qz qw"
 
 
-def _planner_hint(fact: ColumnElement[bool]) -> ColumnElement[bool]:
+def _planner_hint(fact: sa.ColumnElement[bool]) -> sa.ColumnElement[bool]:
     """Return a condition that always holds, rendered for PostgreSQL only: the dtypes of the nodes with such a row.
 
     Without it PostgreSQL read all succeeded nodes, ten times as many, to find the succeeded pick-ups; with it, it uses
     the index on the dtype (50,000 pick-ups in a good half of the time). It then underestimates the pick-ups by a factor
     of ten, and reads and sorts all of them for the latest few. SQLite starts with the rows of the type anyway.
     """
-    return PerDatabase(literal_column("1", Boolean()), postgresql=fact)
+    return PerDatabase(sa.literal_column("1", sa.Boolean()), postgresql=fact)
 
 
 class TablesByName(Protocol):
     """Protocol of the tables behind the views (`views.Tables`)."""
 
-    def __getitem__(self, name: str) -> Table: ...
+    def __getitem__(self, name: str) -> sa.Table: ...
 
 
-def pick_ups_with_context(tables: TablesByName, picked: FromClause, dtypes: Sequence[str]) -> Select[*tuple[Any, ...]]:
+def pick_ups_with_context(
+    tables: TablesByName, picked: sa.FromClause, dtypes: Sequence[str]
+) -> sa.Select[*tuple[Any, ...]]:
     """Return the view's query. A node, its designator and its leaf row have the same id, so they join without a key
     column. `dtypes` are all dtypes that a node with a row in `picked` may have."""
     node, object_, episode = tables["task_tree_node"], tables["object"], tables["process_metadata"]
     robot, place = tables["pose"].alias("robot"), tables["pose"].alias("there")
     stands, lies = numbers(robot, _POSE), numbers(place, _POSE)
 
-    def of_episode(value: ColumnElement[Any]) -> ScalarSelect[Any]:
+    def of_episode(value: sa.ColumnElement[Any]) -> sa.ScalarSelect[Any]:
         # A subquery, which costs nothing where the column is not selected.
-        return select(value).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
+        return sa.select(value).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
 
     seen = dict(zip(_POSE.split(), _seen_from(lies, stands), strict=True))
     in_world = world_line(tables, episode.c.id)  # of an episode that has not ended, or was LOST
-    world = func.coalesce(episode.c.world, episode.c.entered_world, in_world)
+    world = sa.func.coalesce(episode.c.world, episode.c.entered_world, in_world)
 
     return (
-        select(
+        sa.select(
             picked.c.id,
             picked.c.arm,
             picked.c.grasp,
@@ -134,7 +114,7 @@ def pick_ups_with_context(tables: TablesByName, picked: FromClause, dtypes: Sequ
     )
 
 
-def _policy(node: Table) -> ScalarSelect[Any]:
+def _policy(node: sa.Table) -> sa.ScalarSelect[Any]:
     """Return the policy that the node around the pick-up names, or else the node around that.
 
     These are a `MoveAndPickUpAction`, and a `BatchRolloutAction`, which alone names it in episodes of version 0.1.0.
@@ -142,7 +122,7 @@ def _policy(node: Table) -> ScalarSelect[Any]:
     tried, batch = node.alias("tried"), node.alias("batch")
     named = [member(each.c.parameters, "policy") for each in (tried, batch)]
     return (
-        select(func.coalesce(*named))
+        sa.select(sa.func.coalesce(*named))
         .select_from(tried)
         .outerjoin(batch, same_episode(batch, tried, batch.c.id == tried.c.parent_id))
         .where(same_episode(tried, node, tried.c.id == node.c.parent_id))
@@ -150,7 +130,7 @@ def _policy(node: Table) -> ScalarSelect[Any]:
     )
 
 
-def _seen_from(place: Any, robot: Any) -> Iterator[ColumnElement[Any]]:
+def _seen_from(place: Any, robot: Any) -> Iterator[sa.ColumnElement[Any]]:
     """Yield position (m) and orientation of the robot in the object's frame, in arithmetic that every database has."""
     dx, dy, dz = robot.x - place.x, robot.y - place.y, robot.z - place.z
     x, y, z, w = place.qx, place.qy, place.qz, place.qw
@@ -175,24 +155,24 @@ def _seen_from(place: Any, robot: Any) -> Iterator[ColumnElement[Any]]:
 # inner join.
 
 
-def same_episode(one: FromClause, other: FromClause, condition: ColumnElement[bool]) -> ColumnElement[bool]:
+def same_episode(one: sa.FromClause, other: sa.FromClause, condition: sa.ColumnElement[bool]) -> sa.ColumnElement[bool]:
     """Return the condition of a join within an episode."""
-    return and_(condition, one.c[EPISODE] == other.c[EPISODE])
+    return sa.and_(condition, one.c[EPISODE] == other.c[EPISODE])
 
 
-def present(row: FromClause) -> ColumnElement[bool]:
+def present(row: sa.FromClause) -> sa.ColumnElement[bool]:
     """Return the condition that an outer join has a row. From IS NOT NULL PostgreSQL would make it an inner join."""
-    return func.coalesce(row.c.id, 0) > 0
+    return sa.func.coalesce(row.c.id, 0) > 0
 
 
-def numbers(row: FromClause, names: str) -> Any:
+def numbers(row: sa.FromClause, names: str) -> Any:
     """Return columns of an outer join's row that is `present`, as attributes.
 
     On PostgreSQL a filter on one of them does not make the join an inner join.
     """
     columns = {name: row.c[name] for name in names.split()}
     return SimpleNamespace(
-        **{name: PerDatabase(each, postgresql=func.coalesce(each, 0.0)) for name, each in columns.items()}
+        **{name: PerDatabase(each, postgresql=sa.func.coalesce(each, 0.0)) for name, each in columns.items()}
     )
 
 
@@ -203,12 +183,12 @@ def numbers(row: FromClause, names: str) -> Any:
 T = TypeVar("T")
 
 
-class PerDatabase(ColumnElement[T]):
+class PerDatabase(sa.ColumnElement[T]):
     """An expression with a form of its own on PostgreSQL."""
 
     inherit_cache = False
 
-    def __init__(self, sqlite: ColumnElement[T], postgresql: ColumnElement[T]) -> None:
+    def __init__(self, sqlite: sa.ColumnElement[T], postgresql: sa.ColumnElement[T]) -> None:
         self.type = sqlite.type
         self.sqlite = sqlite
         self.postgresql = postgresql
@@ -229,14 +209,14 @@ def _on_postgresql(element: PerDatabase[Any], compiler: Any, **options: Any) -> 
 
 def sql_of(type_: Any, sqlite: str, postgresql: str) -> PerDatabase[Any]:
     """Return an expression of this type that is given as SQL for each database."""
-    return PerDatabase(literal_column(sqlite, type_), literal_column(postgresql, type_))
+    return PerDatabase(sa.literal_column(sqlite, type_), sa.literal_column(postgresql, type_))
 
 
 class _Member(FunctionElement[str]):
     """A member of a JSON object stored as text: a string as text, an object or a list as JSON."""
 
     name = "json_member"
-    type = Text()
+    type = sa.Text()
     inherit_cache = True
 
 
@@ -252,26 +232,26 @@ def _of_json(element: _Member, compiler: Any, **options: Any) -> str:
     return f"({document}::json ->> {path.replace('$.', '')})"
 
 
-def member(document: ColumnElement[Any], name: str) -> ColumnElement[str]:
+def member(document: sa.ColumnElement[Any], name: str) -> sa.ColumnElement[str]:
     """Return the member of this name of a document of JSON, as text; NULL if the document has none."""
     assert name.isidentifier(), name
-    return _Member(document, literal_column(f"'$.{name}'"))
+    return _Member(document, sa.literal_column(f"'$.{name}'"))
 
 
-def event_of(row: ColumnElement[int]) -> ColumnElement[int]:
+def event_of(row: sa.ColumnElement[int]) -> sa.ColumnElement[int]:
     """Return the sequence of the event in the id of a row."""
     return row.bitwise_rshift(SLOT_MAX.bit_length()).bitwise_and(SEQUENCE_MAX)
 
 
-def absent(number: ColumnElement[int], key: ColumnElement[int]) -> ColumnElement[bool]:
+def absent(number: sa.ColumnElement[int], key: sa.ColumnElement[int]) -> sa.ColumnElement[bool]:
     """Return the condition that a number is not in a table of keys, evaluated by one index lookup for each row.
 
     With 20,000 simulations in the table, a query for one episode and a query for all pick-ups take as long as without
     any. PostgreSQL evaluates NOT IN by listing all simulations first, which takes 10 to 80 ms, and NOT EXISTS by one
     more join for each view in a query. SQLite uses the index for NOT IN and is slower with any other form.
     """
-    looked_up = select(key).where(key == number).scalar_subquery()
-    return PerDatabase(sqlite=number.not_in(select(key)), postgresql=looked_up.is_(None))
+    looked_up = sa.select(key).where(key == number).scalar_subquery()
+    return PerDatabase(sqlite=number.not_in(sa.select(key)), postgresql=looked_up.is_(None))
 
 
 # === world line ===============================================================================================
@@ -286,18 +266,18 @@ OBJECTS_MAX = 1_000
 """Bounds the objects in the line, because an episode may add any number."""
 
 
-def world_line(tables: TablesByName, episode: ColumnElement[int]) -> ColumnElement[str]:
+def world_line(tables: TablesByName, episode: sa.ColumnElement[int]) -> sa.ColumnElement[str]:
     """Return name and type of the objects in the world of the episode, such as `pr2 (ROBOT), milk (MILK)`.
 
     If the world was left, of those that were in it; null if there were none.
     """
     objects, removals = tables["object"], tables["object_removal"]
-    removed = exists().where(
+    removed = sa.exists().where(
         removals.c.identity_id == objects.c.id, removals.c.process_metadata_id == objects.c.process_metadata_id
     )
-    first, present = func.min(objects.c.id), func.min(case((removed, 1), else_=0)) == 0
+    first, present = sa.func.min(objects.c.id), sa.func.min(sa.case((removed, 1), else_=0)) == 0
     listed = (
-        select((objects.c.name + " (" + objects.c.obj_type + ")").label("object"), present.label("present"))
+        sa.select((objects.c.name + " (" + objects.c.obj_type + ")").label("object"), present.label("present"))
         .where(objects.c.process_metadata_id == episode, objects.c.identity_id == objects.c.id)
         .group_by(objects.c.name, objects.c.obj_type)
         .order_by(present.desc(), first)
@@ -305,9 +285,9 @@ def world_line(tables: TablesByName, episode: ColumnElement[int]) -> ColumnEleme
         .correlate(episode.table)
         .subquery("listed")
     )
-    names = func.aggregate_strings(listed.c.object, ", ")
-    line = func.coalesce(names.filter(listed.c.present), names)
-    return select(line).select_from(listed).correlate(episode.table).scalar_subquery()
+    names = sa.func.aggregate_strings(listed.c.object, ", ")
+    line = sa.func.coalesce(names.filter(listed.c.present), names)
+    return sa.select(line).select_from(listed).correlate(episode.table).scalar_subquery()
 
 
 # === concept views ============================================================================================
@@ -318,23 +298,23 @@ def world_line(tables: TablesByName, episode: ColumnElement[int]) -> ColumnEleme
 # table, fold or rebuild.
 
 
-def _concepts() -> TextualSelect:
+def _concepts() -> sa.TextualSelect:
     parents = (
         (name, parent, each.source) for name, each in sorted(CONCEPTS.items()) for parent in each.parents or (None,)
     )
-    return constants({"name": Text(), "parent": Text(), "source": Text()}, parents)
+    return constants({"name": sa.Text(), "parent": sa.Text(), "source": sa.Text()}, parents)
 
 
-def _ancestors() -> TextualSelect:
+def _ancestors() -> sa.TextualSelect:
     pairs = ((name, ancestor) for name in sorted(CONCEPTS) for ancestor in ancestors(name))
-    return constants({"concept": Text(), "ancestor": Text()}, pairs)
+    return constants({"concept": sa.Text(), "ancestor": sa.Text()}, pairs)
 
 
-def _of_objects() -> TextualSelect:
-    return constants({"obj_type": Text(), "concept": Text()}, sorted(CONCEPT_OF_OBJECT_TYPE.items()))
+def _of_objects() -> sa.TextualSelect:
+    return constants({"obj_type": sa.Text(), "concept": sa.Text()}, sorted(CONCEPT_OF_OBJECT_TYPE.items()))
 
 
-CONCEPT_VIEWS: Final[dict[str, Callable[[], TextualSelect]]] = {
+CONCEPT_VIEWS: Final[dict[str, Callable[[], sa.TextualSelect]]] = {
     "concept": _concepts,
     "concept_ancestor": _ancestors,
     "object_concept": _of_objects,
@@ -349,15 +329,15 @@ CONCEPT_VIEWS: Final[dict[str, Callable[[], TextualSelect]]] = {
 # It is text, because composing hundreds of constants would take a tenth of a second in each process.
 
 
-def constants(columns: Mapping[str, TypeEngine[Any]], rows: Iterable[Iterable[str | float | None]]) -> TextualSelect:
+def constants(columns: Mapping[str, TypeEngine[Any]], rows: Iterable[Iterable[str | float | None]]) -> sa.TextualSelect:
     """Return a select of these rows; texts must be plain words, all other columns are numbers."""
     values = ", ".join(f"({', '.join(map(_literal, row))})" for row in rows)
     shown = ", ".join(  # both databases call the columns of VALUES column1, column2 …
-        f"CAST(column{place} AS {'TEXT' if isinstance(kind, Text) else 'DOUBLE PRECISION'}) AS {name}"
+        f"CAST(column{place} AS {'TEXT' if isinstance(kind, sa.Text) else 'DOUBLE PRECISION'}) AS {name}"
         for place, (name, kind) in enumerate(columns.items(), 1)
     )
     selected = text(f"SELECT {shown} FROM (VALUES {values}) AS facts")  # noqa: S608  constants of the program
-    return selected.columns(*(column(name, kind) for name, kind in columns.items()))
+    return selected.columns(*(sa.column(name, kind) for name, kind in columns.items()))
 
 
 def _literal(value: str | float | None) -> str:
@@ -420,12 +400,12 @@ _FIELDS_POSTGRESQL = """json_each(CAST(up.parameters AS json)) AS field WHERE
  OR (field.value ->> 'dtype' IS NOT NULL AND field.value ->> 'name' IS NOT NULL))"""
 
 
-def root_failures(tables: TablesByName) -> Select[*tuple[Any, ...]]:
+def root_failures(tables: TablesByName) -> sa.Select[*tuple[Any, ...]]:
     """Return the view's query."""
     nodes, objects = tables["task_tree_node"], tables["object"]
     child = nodes.alias("child")
-    failed_child = exists(
-        select(literal_column("1")).where(
+    failed_child = sa.exists(
+        sa.select(sa.literal_column("1")).where(
             child.c.parent_id == nodes.c.id,
             child.c[EPISODE] == nodes.c[EPISODE],
             child.c.status.in_(_FAILED),
@@ -442,21 +422,21 @@ def root_failures(tables: TablesByName) -> Select[*tuple[Any, ...]]:
         return f"({sql(_STARTED, above, value=sql(value))} {condition} {_NEAREST})"
 
     object_ = sql_of(
-        Text(),
+        sa.Text(),
         nearest(_OBJECT_SQLITE, f", {_FIELDS_SQLITE}", _ABOVE_SQLITE),
         nearest(_OBJECT_POSTGRESQL, f", {_FIELDS_POSTGRESQL}", _ABOVE_POSTGRESQL),
     )
     arm = sql_of(
-        Text(),
+        sa.Text(),
         nearest(_ARM_SQLITE, f"WHERE {_ARM_SQLITE} IS NOT NULL", _ABOVE_SQLITE),
         nearest(_ARM_POSTGRESQL, f"WHERE {_ARM_POSTGRESQL} IS NOT NULL", _ABOVE_POSTGRESQL),
     )
-    return select(
+    return sa.select(
         nodes.c.id,
         nodes.c.process_metadata_id,
         nodes.c.dtype,
         nodes.c.status,
-        sql_of(Text(), *climbing(_PATH)).label("path"),
+        sql_of(sa.Text(), *climbing(_PATH)).label("path"),
         object_.label("object"),
         arm.label("arm"),
         nodes.c.reason,
@@ -539,7 +519,7 @@ _OUTCOME = f"""CASE WHEN {{node}}.status IN ({_FAILED_SQL}) THEN coalesce((
  WHERE judged.outcome IS NOT NULL ORDER BY judged.depth LIMIT 1), 'failed') END"""  # noqa: S608
 
 
-def outcome_of(nodes: Table) -> ColumnElement[str]:
+def outcome_of(nodes: sa.Table) -> sa.ColumnElement[str]:
     """Return the outcome of a node that FAILED or ended in ERROR, one of `OUTCOMES`; null for any other node.
 
     On PostgreSQL no index fits the expression of a later node's type, so that later nodes are read in their order by
@@ -555,7 +535,7 @@ def outcome_of(nodes: Table) -> ColumnElement[str]:
         return _OUTCOME.format(node=nodes.name, about=about, **later, **ways)
 
     return sql_of(
-        Text(),
+        sa.Text(),
         sql(_ABOVE_SQLITE, _ABOUT_SQLITE, _OFFERS_SQLITE, "later.dtype"),
         sql(_ABOVE_POSTGRESQL, _ABOUT_POSTGRESQL, _OFFERS_POSTGRESQL, "later.dtype || ''"),
     )
@@ -575,49 +555,51 @@ _NUMBERS = [f"{letter}{axis}" for letter in "cha" for axis in _AXES]
 """A box: its center, half of its edges, and the direction in which its joint slides it."""
 
 
-def spatial_relations(tables: TablesByName, picked: FromClause, placed: FromClause, *, simulated: bool) -> Select[Any]:
+def spatial_relations(
+    tables: TablesByName, picked: sa.FromClause, placed: sa.FromClause, *, simulated: bool
+) -> sa.Select[Any]:
     """Return the view's query; `picked` and `placed` are the rows of pick-ups and placings."""
     moments = _moments(tables, picked, placed, simulated=simulated)
     boxes = _boxes(tables[LINK_BOX])
     # The second select continues the first. PostgreSQL would compute two that are joined by their nodes once a node.
     one = _placed_boxes(tables, moments, _around(boxes), same=True)
     both = _placed_boxes(tables, one, boxes, same=False).c
-    gaps = [func.abs(both[f"one_c{axis}"] - both[f"other_c{axis}"]) - both[f"other_h{axis}"] for axis in _AXES]
+    gaps = [sa.func.abs(both[f"one_c{axis}"] - both[f"other_c{axis}"]) - both[f"other_h{axis}"] for axis in _AXES]
     within = [gap <= 0 for gap in gaps]
     bottom, top = both.one_cz - both.one_hz, both.other_cz + both.other_hz
     apart = [
-        case((gap > both[f"one_h{axis}"], gap - both[f"one_h{axis}"]), else_=0.0)
+        sa.case((gap > both[f"one_h{axis}"], gap - both[f"one_h{axis}"]), else_=0.0)
         for gap, axis in zip(gaps, _AXES, strict=True)
     ]
     gap_squared = apart[0] * apart[0] + apart[1] * apart[1]
-    near = and_(gap_squared <= NEXT_TO_M**2, apart[2] <= 0, both.other_obj_type != _ENVIRONMENT)
-    relation = case(
-        (and_(func.abs(bottom - top) <= ON_M, within[0], within[1]), "on"),
-        (and_(*within), "in"),
+    near = sa.and_(gap_squared <= NEXT_TO_M**2, apart[2] <= 0, both.other_obj_type != _ENVIRONMENT)
+    relation = sa.case(
+        (sa.and_(sa.func.abs(bottom - top) <= ON_M, within[0], within[1]), "on"),
+        (sa.and_(*within), "in"),
         (near, "next to"),
     )
-    related = select(
+    related = sa.select(
         both.node_id,
         both.process_metadata_id,
         both.one_id.label("object_id"),
         both.one_name.label("object"),
-        cast(relation, Text()).label("relation"),
+        sa.cast(relation, sa.Text()).label("relation"),
         both.other_id,
         both.other_name.label("other"),
         both.other_link.label("link"),
         event_of(both.node_id).label("sequence"),
     ).subquery("related")
-    return select(*related.c).where(related.c.relation.is_not(None))
+    return sa.select(*related.c).where(related.c.relation.is_not(None))
 
 
-def _moments(tables: TablesByName, picked: FromClause, placed: FromClause, *, simulated: bool) -> Subquery:
+def _moments(tables: TablesByName, picked: sa.FromClause, placed: sa.FromClause, *, simulated: bool) -> sa.Subquery:
     """Return nodes with the identity of their object and the id of a row made from the event at their moment."""
     node, target = tables["task_tree_node"], tables["object"].alias("target")
     first_id = node.c.id.bitwise_rshift(_NUMBER_BITS).bitwise_lshift(_NUMBER_BITS)
     ended = first_id + node.c.end_sequence.bitwise_lshift(_SLOT_BITS)
-    return union_all(
+    return sa.union_all(
         *(
-            select(
+            sa.select(
                 node.c.id.label("node_id"),
                 node.c.process_metadata_id,
                 target.c.identity_id,
@@ -632,61 +614,65 @@ def _moments(tables: TablesByName, picked: FromClause, placed: FromClause, *, si
     ).subquery("moment")
 
 
-def _placed_boxes(tables: TablesByName, moments: Subquery, boxes: Subquery, *, same: bool) -> Subquery:
+def _placed_boxes(tables: TablesByName, moments: sa.Subquery, boxes: sa.Subquery, *, same: bool) -> sa.Subquery:
     """Return the moments with the boxes in the map: of the picked up or placed object itself, or of all others."""
     name = "one" if same else "other"
     added, then, later = (tables["object"].alias(f"{name}_{each}") for each in ("added", "then", "later"))
     removal, pose = tables["object_removal"].alias(), tables["pose"].alias()
     box = boxes.alias(f"{name}_box")
     last = (
-        select(func.max(later.c.id))
+        sa.select(sa.func.max(later.c.id))
         .where(same_episode(later, added, later.c.identity_id == added.c.id))
         .where(later.c.dtype == "Object", later.c.id <= moments.c.moment)
         .scalar_subquery()
     )
-    removed = exists(
-        select(literal(1))
+    removed = sa.exists(
+        sa.select(sa.literal(1))
         .where(same_episode(removal, added, removal.c.identity_id == added.c.id))
         .where(removal.c.id <= moments.c.moment)
     )
     # Joined, because SQLite would compute a subquery in the columns once for each use of a column.
     slid = tables["joint_change"].alias(f"{name}_slid")
     last_change = _last_change(tables, added, box, moments)
-    centre = [box.c[f"c{axis}"] + box.c[f"a{axis}"] * func.coalesce(slid.c.position, 0.0) for axis in _AXES]
+    centre = [box.c[f"c{axis}"] + box.c[f"a{axis}"] * sa.func.coalesce(slid.c.position, 0.0) for axis in _AXES]
     rotation = _rotation(pose)
-    columns: list[ColumnElement[Any]] = []
+    columns: list[sa.ColumnElement[Any]] = []
     for axis, row in zip(_AXES, rotation, strict=True):
         along = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2]
-        half = sum((func.abs(row[each]) * box.c[f"h{_AXES[each]}"] for each in (1, 2)), func.abs(row[0]) * box.c.hx)
+        half = sum(
+            (sa.func.abs(row[each]) * box.c[f"h{_AXES[each]}"] for each in (1, 2)), sa.func.abs(row[0]) * box.c.hx
+        )
         columns += [(pose.c[axis] + along).label(f"{name}_c{axis}"), half.label(f"{name}_h{axis}")]
-    built_in = case((added.c.obj_type == _ENVIRONMENT, added.c.name), else_=added.c.obj_type)
+    built_in = sa.case((added.c.obj_type == _ENVIRONMENT, added.c.name), else_=added.c.obj_type)
     is_one = added.c.id == moments.c.identity_id
     return (
-        select(
+        sa.select(
             *moments.c,
             then.c.id.label(f"{name}_id"),
             then.c.name.label(f"{name}_name"),
             then.c.obj_type.label(f"{name}_obj_type"),
-            func.coalesce(box.c.link, then.c.name).label(f"{name}_link"),
+            sa.func.coalesce(box.c.link, then.c.name).label(f"{name}_link"),
             *columns,
         )
         .select_from(moments)
         .join(added, same_episode(added, moments, is_one if same else ~is_one))
         .outerjoin(then, same_episode(then, moments, then.c.id == last))
         .outerjoin(pose, same_episode(pose, then, pose.c.id == then.c.pose_id))
-        .join(box, box.c.model == func.coalesce(added.c.description_fingerprint, built_in))
-        .outerjoin(slid, same_episode(slid, moments, and_(slid.c.joint == box.c.joint, slid.c.id == last_change)))
+        .join(box, box.c.model == sa.func.coalesce(added.c.description_fingerprint, built_in))
+        .outerjoin(slid, same_episode(slid, moments, sa.and_(slid.c.joint == box.c.joint, slid.c.id == last_change)))
         .where(added.c.id == added.c.identity_id, added.c.id <= moments.c.moment, ~removed)
         .where(added.c.obj_type != _ROBOT, present(pose))
         .subquery(name)
     )
 
 
-def _last_change(tables: TablesByName, added: FromClause, box: FromClause, moments: Subquery) -> ColumnElement[int]:
+def _last_change(
+    tables: TablesByName, added: sa.FromClause, box: sa.FromClause, moments: sa.Subquery
+) -> sa.ColumnElement[int]:
     """Return the id of the last change of the joint that slides a box."""
     change, moved = tables["joint_change"].alias(), tables["object"].alias()
     return (
-        select(func.max(change.c.id))
+        sa.select(sa.func.max(change.c.id))
         .join_from(change, moved, same_episode(moved, change, moved.c.id == change.c.object_id))
         .where(same_episode(moved, added, moved.c.identity_id == added.c.id))
         .where(change.c.joint == box.c.joint, change.c.id <= moments.c.moment)
@@ -694,7 +680,7 @@ def _last_change(tables: TablesByName, added: FromClause, box: FromClause, momen
     )
 
 
-def _rotation(pose: FromClause) -> list[list[ColumnElement[float]]]:
+def _rotation(pose: sa.FromClause) -> list[list[sa.ColumnElement[float]]]:
     x, y, z, w = (pose.c[f"q{axis}"] for axis in "xyzw")
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -703,27 +689,29 @@ def _rotation(pose: FromClause) -> list[list[ColumnElement[float]]]:
     ]
 
 
-def _boxes(described: Table) -> Subquery:
+def _boxes(described: sa.Table) -> sa.Subquery:
     """Return the boxes of all links, with their model: the fingerprint of a description, or a built-in one."""
     built_in = _built_in().subquery("built_in")
-    return union_all(select(*built_in.c), select(*(described.c[each.name] for each in built_in.c))).subquery("box")
+    return sa.union_all(sa.select(*built_in.c), sa.select(*(described.c[each.name] for each in built_in.c))).subquery(
+        "box"
+    )
 
 
-def _around(boxes: Subquery) -> Subquery:
+def _around(boxes: sa.Subquery) -> sa.Subquery:
     """Return one box for each model, around those of its links."""
-    low = {axis: func.min(boxes.c[f"c{axis}"] - boxes.c[f"h{axis}"]) for axis in _AXES}
-    high = {axis: func.max(boxes.c[f"c{axis}"] + boxes.c[f"h{axis}"]) for axis in _AXES}
-    columns: list[ColumnElement[Any]] = [((low[axis] + high[axis]) / 2).label(f"c{axis}") for axis in _AXES]
+    low = {axis: sa.func.min(boxes.c[f"c{axis}"] - boxes.c[f"h{axis}"]) for axis in _AXES}
+    high = {axis: sa.func.max(boxes.c[f"c{axis}"] + boxes.c[f"h{axis}"]) for axis in _AXES}
+    columns: list[sa.ColumnElement[Any]] = [((low[axis] + high[axis]) / 2).label(f"c{axis}") for axis in _AXES]
     columns += [((high[axis] - low[axis]) / 2).label(f"h{axis}") for axis in _AXES]
-    columns += [literal(0.0).label(f"a{axis}") for axis in _AXES]
-    nothing = cast(null(), Text())
-    around = select(boxes.c.model, nothing.label("link"), nothing.label("joint"), *columns).group_by(boxes.c.model)
+    columns += [sa.literal(0.0).label(f"a{axis}") for axis in _AXES]
+    nothing = sa.cast(sa.null(), sa.Text())
+    around = sa.select(boxes.c.model, nothing.label("link"), nothing.label("joint"), *columns).group_by(boxes.c.model)
     return around.subquery("around")
 
 
 @lru_cache(maxsize=1)
-def _built_in() -> TextualSelect:
-    kinds: dict[str, TypeEngine[Any]] = {name: Text() for name in _TEXTS} | {name: Double() for name in _NUMBERS}
+def _built_in() -> sa.TextualSelect:
+    kinds: dict[str, TypeEngine[Any]] = {name: sa.Text() for name in _TEXTS} | {name: sa.Double() for name in _NUMBERS}
     return constants(kinds, _built_in_rows())
 
 

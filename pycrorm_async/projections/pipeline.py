@@ -42,19 +42,10 @@ from sqlalchemy import TableClause, column, or_, select, table, text, update
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged
+from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import Layout, Storage, physical_name, unite
 from pycrorm_async.projections.fold import TableRows
-from pycrorm_async.projections.generations import (
-    Generation,
-    GrowthTarget,
-    Hold,
-    current_generation,
-    grow,
-    grow_tables,
-    read_generation,
-    show,
-    write_generation,
-)
+from pycrorm_async.projections.generations import grow
 from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
@@ -177,7 +168,7 @@ class FoldRunner:
         self._log = target.log
         self._learn = learn
         self._batch_events = batch_events
-        self.generation: Generation | None = None
+        self.generation: generations.Generation | None = None
         """The state of the target's generation when this process last read it."""
         self.last_number = 0
         """The last episode of the last batch; the next one begins with the episode behind it."""
@@ -316,7 +307,9 @@ class FoldRunner:
             await sweep(self._log)
         return 0 if grown else batch.events
 
-    async def _lock_generation(self, connection: AsyncConnection, batch: _PreparedBatch) -> Generation | None:
+    async def _lock_generation(
+        self, connection: AsyncConnection, batch: _PreparedBatch
+    ) -> generations.Generation | None:
         """Lock the generation and create missing tables; return None if its number or revision has changed.
 
         The layout of the result differs from that of the batch if some tables could not be created.
@@ -331,14 +324,16 @@ class FoldRunner:
             return None
         return await grow(connection, self._target, generation, types.payloads) if growing else generation
 
-    async def _write_rows(self, connection: AsyncConnection, batch: _PreparedBatch, generation: Generation) -> bool:
+    async def _write_rows(
+        self, connection: AsyncConnection, batch: _PreparedBatch, generation: generations.Generation
+    ) -> bool:
         """Write rows and checkpoints; return False, to roll back, if a checkpoint has moved."""
         if not await self._target.advance(connection, batch.steps, batch.parked):
             return False
         await batch.rows.write(connection, generation.number)
         return True
 
-    async def _types_now(self) -> tuple[Generation, _Types]:
+    async def _types_now(self) -> tuple[generations.Generation, _Types]:
         """Read the declarations. They include those of all stored events: each is stored before its first use."""
         payloads = await self._log.declarations()
         if self.generation is None:
@@ -538,7 +533,7 @@ class Share(NamedTuple):
 WHOLE = Share()
 
 
-class FoldTarget(GrowthTarget, Protocol):
+class FoldTarget(generations.GrowthTarget, Protocol):
     """A generation to fold into, and its checkpoints. Methods with a connection run in the caller's transaction."""
 
     log: EventLog
@@ -551,7 +546,7 @@ class FoldTarget(GrowthTarget, Protocol):
         """Advance checkpoints and park episodes; return False if a checkpoint has moved: then roll back."""
         ...
 
-    async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:
+    async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
         """Read the generation and lock it until the transaction ends."""
         ...
 
@@ -576,14 +571,16 @@ class LiveTarget:
             await park(connection, number, reason)
         return True
 
-    async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:
-        generation = await current_generation(connection, hold=hold)
+    async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
+        generation = await generations.current_generation(connection, hold=hold)
         if generation is None:
             raise DatabaseUnavailable("the tables are missing: restore them from a backup, or run `pycrorm rebuild`")
         return generation
 
-    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-        return await show(connection, await grow_tables(connection, generation, layout))
+    async def grow(
+        self, connection: AsyncConnection, generation: generations.Generation, layout: Layout
+    ) -> generations.Generation:
+        return await generations.show(connection, await generations.grow_tables(connection, generation, layout))
 
     async def missing(self, number: int, sequence: int) -> str:  # noqa: ARG002 - of the protocol
         return f"event {sequence} is missing in the log"
@@ -644,8 +641,8 @@ class SideTarget:
             _log.warning("episode %s is parked in the projection %s: %s", number, self._projection, reason)
         return True
 
-    async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:
-        generation = await read_generation(connection, self._key, hold=hold)
+    async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
+        generation = await generations.read_generation(connection, self._key, hold=hold)
         if generation is None or self._number not in (None, generation.number):
             raise InternalError(
                 f"another process replaced the tables of {self._projection or 'the memory'} during the fold"
@@ -657,9 +654,11 @@ class SideTarget:
         self._place = place_of(generation.number, self._projection)
         return generation
 
-    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-        grown = await grow_tables(connection, generation, layout)
-        await write_generation(connection, self._key, grown)
+    async def grow(
+        self, connection: AsyncConnection, generation: generations.Generation, layout: Layout
+    ) -> generations.Generation:
+        grown = await generations.grow_tables(connection, generation, layout)
+        await generations.write_generation(connection, self._key, grown)
         return grown
 
     async def missing(self, number: int, sequence: int) -> str:

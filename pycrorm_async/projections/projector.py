@@ -14,16 +14,9 @@ from dataclasses import replace
 from sqlalchemy import text
 
 from pycrorm_async.errors import CallerError, DatabaseForeign
+from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import next_number
 from pycrorm_async.projections.custom import CustomTables, Projection
-from pycrorm_async.projections.generations import (
-    ViewRefused,
-    current_generation,
-    grow_tables,
-    make_generation,
-    refresh_some,
-    show,
-)
 from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
 from pycrorm_async.projections.pipeline import FoldRunner, LiveTarget, sweep
 from pycrorm_async.store.dialects import dialect_of
@@ -74,15 +67,17 @@ class Projector:
         with self._log.translated():
             async with self._log.engine.begin() as connection:
                 await dialect_of(connection).lock_log_changes(connection)
-                current = await current_generation(connection, hold="change")
+                current = await generations.current_generation(connection, hold="change")
                 if current is None and (await connection.execute(_ANYTHING_FOLDED)).first() is not None:
                     raise DatabaseForeign(f"{self._log.address}: the tables are missing: run `pycrorm rebuild`")
-                generation = current or await make_generation(connection, next_number(()))
+                generation = current or await generations.make_generation(connection, next_number(()))
                 layout = generation.layout.with_leaves(mapped_leaves())
                 layout = with_user_views(layout, self._views, connection.dialect).with_failed_views({})
                 changed = await self._custom.set_up(connection, layout)
                 if current is None or layout != generation.layout or changed:
-                    generation = await show(connection, await grow_tables(connection, generation, layout))
+                    generation = await generations.show(
+                        connection, await generations.grow_tables(connection, generation, layout)
+                    )
                 registered = {} if current is None else current.layout.user_views
                 for name, reason in generation.layout.failed_views.items():
                     if registered.get(name) != layout.user_views.get(name):  # new or changed by this caller
@@ -128,10 +123,10 @@ class Projector:
             await dialect_of(connection).lock_log_changes(connection)
             generation = await self._target.generation(connection, "change")
             try:
-                return await refresh_some(connection, generation.layout, generation.number)
-            except ViewRefused as fault:
+                return await generations.refresh_some(connection, generation.layout, generation.number)
+            except generations.ViewRefused as fault:
                 _log.warning("%s; it is left out", fault)
                 layout = generation.layout
                 layout = layout.with_failed_views(layout.failed_views | {fault.view: fault.reason})
-                await show(connection, replace(generation, revision=generation.revision + 1, layout=layout))
+                await generations.show(connection, replace(generation, revision=generation.revision + 1, layout=layout))
                 return True

@@ -35,16 +35,8 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
-from pycrorm_async.projections import pipeline
+from pycrorm_async.projections import custom, pipeline
 from pycrorm_async.projections.columns import CORE, OF_NO_EPISODE, next_number, physical_name
-from pycrorm_async.projections.custom import (
-    Projection,
-    events_of_batch,
-    layout_of,
-    learner_of,
-    make_projection_tables,
-    refuse_taken,
-)
 from pycrorm_async.projections.generations import (
     MAKING,
     PROJECTION,
@@ -115,7 +107,7 @@ class Rebuild:
         generation: Generation,
         *,
         share: Share = WHOLE,
-        projection: Projection | None = None,
+        projection: custom.Projection | None = None,
     ) -> None:
         self._log = log
         self.number = generation.number
@@ -125,13 +117,13 @@ class Rebuild:
         self._place = pipeline.place_of(generation.number, name)
         key = f"{self._key}{_MAKING}"
         self._making = SideTarget(log, key, name, generation.version, number=generation.number, share=share)
-        learn = learn_tables if projection is None else learner_of(projection)
-        batch_events = _BATCH_EVENTS if projection is None else events_of_batch(projection, _BATCH_EVENTS)
+        learn = learn_tables if projection is None else custom.learner_of(projection)
+        batch_events = _BATCH_EVENTS if projection is None else custom.events_of_batch(projection, _BATCH_EVENTS)
         self._runner = FoldRunner(self._making, learn, batch_events=batch_events)
 
     @classmethod
     async def begin(
-        cls, log: EventLog, *, views: Sequence[UserView] = (), projection: Projection | None = None
+        cls, log: EventLog, *, views: Sequence[UserView] = (), projection: custom.Projection | None = None
     ) -> Self:
         """Resume the generation of an earlier rebuild, or create one with the tables of all declared types.
 
@@ -309,18 +301,18 @@ async def _resumable(
 
 
 async def _begin_projection(
-    connection: AsyncConnection, generations: Mapping[str, Generation], projection: Projection
+    connection: AsyncConnection, generations: Mapping[str, Generation], projection: custom.Projection
 ) -> Generation:
     tables = await current_generation(connection)
     if tables is None:
         raise DatabaseForeign("the database has no tables yet: run `pycrorm rebuild` without a name")
-    layout = layout_of(projection, connection.dialect)
-    refuse_taken(projection.name, layout, tables.layout, projections_in(generations))
+    layout = custom.layout_of(projection, connection.dialect)
+    custom.refuse_taken(projection.name, layout, tables.layout, projections_in(generations))
     key = f"{PROJECTION}{projection.name}"
     making = await _resumable(
         connection, generations, key, lambda each: each.version == projection.version and each.layout == layout
     )
-    return making or await make_projection_tables(connection, projection, f"{key}{_MAKING}")
+    return making or await custom.make_projection_tables(connection, projection, f"{key}{_MAKING}")
 
 
 # === replaced tables ==========================================================================================

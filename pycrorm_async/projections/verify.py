@@ -15,33 +15,8 @@ from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, ObjectAdded, references_in
-from pycrorm_async.projections import pipeline
+from pycrorm_async.projections import custom, findings, fold, pipeline
 from pycrorm_async.projections.columns import OWN, Layout, unite
-from pycrorm_async.projections.custom import (
-    CustomRows,
-    PackedProjection,
-    Projection,
-    fault_in_version,
-    layout_of,
-    learner_of,
-)
-from pycrorm_async.projections.findings import (
-    Comparison,
-    EpisodeRange,
-    StoppedEpisode,
-    TableCheck,
-    TableDifference,
-    Unreadable,
-    VerifyResult,
-)
-from pycrorm_async.projections.fold import (
-    UndecodablePayload,
-    boxes_of,
-    fold_happening,
-    happening_of,
-    name_episodes,
-    uuids_of,
-)
 from pycrorm_async.projections.generations import (
     Generation,
     current_generation,
@@ -53,20 +28,10 @@ from pycrorm_async.projections.generations import (
 from pycrorm_async.projections.node_row import STATUS
 from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
-from pycrorm_async.store import schema
+from pycrorm_async.store import schema, stored
 from pycrorm_async.store.address import no_tables
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import (
-    BLOCK_EVENTS,
-    EpisodeRow,
-    RunningDigest,
-    Span,
-    StoredEvent,
-    consecutive,
-    pages_of,
-    size_of,
-)
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
@@ -105,11 +70,11 @@ class DigestCheck:
     With `certain`, every writer of a version with digests stores them. On PostgreSQL a login may lack the right to.
     """
 
-    def __init__(self, episode: EpisodeRow, result: VerifyResult, *, certain: bool) -> None:
+    def __init__(self, episode: stored.EpisodeRow, result: findings.VerifyResult, *, certain: bool) -> None:
         self._number = episode.number
         self._result = result
         self._certain = certain
-        self._running: RunningDigest | None = RunningDigest.at_start(episode.identity)
+        self._running: stored.RunningDigest | None = stored.RunningDigest.at_start(episode.identity)
         tags = () if episode.ended_wall_ns is None else ("EpisodeTagged",)  # behind the end each has a digest
         self._last_types = ("EpisodeEnded", *tags)
         self._has_digest = False
@@ -117,9 +82,9 @@ class DigestCheck:
 
     def read(
         self,
-        span: Span,
+        span: stored.Span,
         head: int,
-        events: Mapping[int, StoredEvent],
+        events: Mapping[int, stored.StoredEvent],
         kept: Mapping[int, str],
         checked: EpisodeCheck,
     ) -> None:
@@ -129,26 +94,26 @@ class DigestCheck:
         damage was reported for an event of a block, the digest of that block is not reported too.
         """
         done = span.after
-        block_ends = range(done - done % BLOCK_EVENTS + BLOCK_EVENTS, span.last + 1, BLOCK_EVENTS)
+        block_ends = range(done - done % stored.BLOCK_EVENTS + stored.BLOCK_EVENTS, span.last + 1, stored.BLOCK_EVENTS)
         ends = {each for each in kept if span.after < each <= span.last}
         for end in sorted({*ends, *block_ends, span.last} - {span.after}):
             present = [events[each] for each in range(done + 1, end + 1) if each in events]
             digest = self._digest_behind(present, end - done)
-            block = (end - 1) // BLOCK_EVENTS
+            block = (end - 1) // stored.BLOCK_EVENTS
             last = events.get(end)
             if end in kept:
                 self._has_digest = True
                 if digest not in (None, kept[end]) and block not in checked.damaged_blocks:
-                    self._report(block * BLOCK_EVENTS + 1, end)
-            elif end % BLOCK_EVENTS == 0 or (end == head and last is not None and last.type in self._last_types):
+                    self._report(block * stored.BLOCK_EVENTS + 1, end)
+            elif end % stored.BLOCK_EVENTS == 0 or (end == head and last is not None and last.type in self._last_types):
                 self._missing = self._missing or end
-            if end % BLOCK_EVENTS == 0 and end in kept:
+            if end % stored.BLOCK_EVENTS == 0 and end in kept:
                 self._running = _behind(kept[end], end)
             done = end
         if span.last == head and self._missing is not None:
             self._report_missing(self._missing, described=checked.described)
 
-    def _digest_behind(self, events: Sequence[StoredEvent], count: int) -> str | None:
+    def _digest_behind(self, events: Sequence[stored.StoredEvent], count: int) -> str | None:
         """Add the next `count` events and return the digest; None if one of them is missing, or one before them."""
         if self._running is None or len(events) < count:
             self._running = None
@@ -172,9 +137,9 @@ class DigestCheck:
             self._result.add_without_digest(self._number)
 
 
-def _behind(digest: str, sequence: int) -> RunningDigest | None:
+def _behind(digest: str, sequence: int) -> stored.RunningDigest | None:
     try:
-        return RunningDigest(bytes.fromhex(digest), sequence)
+        return stored.RunningDigest(bytes.fromhex(digest), sequence)
     except ValueError:  # it was replaced by another text, which was reported, or is too long for the hash function
         return None
 
@@ -183,7 +148,7 @@ async def _has_digests(connection: AsyncConnection) -> bool:
     return (await dialect_of(connection).table_state(connection, schema.DIGEST)).readable
 
 
-async def read_kept(connection: AsyncConnection, episodes: EpisodeRange) -> dict[int, dict[int, str]]:
+async def read_kept(connection: AsyncConnection, episodes: findings.EpisodeRange) -> dict[int, dict[int, str]]:
     """Read the digests kept of these episodes, by number and sequence."""
     if not await _has_digests(connection):
         return {}
@@ -192,7 +157,7 @@ async def read_kept(connection: AsyncConnection, episodes: EpisodeRange) -> dict
     return {number: {each.sequence: each.digest for each in some} for number, some in by_number}
 
 
-async def check_places(connection: AsyncConnection, limits: Mapping[str, int], result: VerifyResult) -> None:
+async def check_places(connection: AsyncConnection, limits: Mapping[str, int], result: findings.VerifyResult) -> None:
     """Report digests of events and of episodes that the log does not have: they were deleted."""
     if not await _has_digests(connection):
         return
@@ -204,7 +169,7 @@ async def check_places(connection: AsyncConnection, limits: Mapping[str, int], r
 
 
 async def check_outside(
-    log: EventLog, digests: Iterable[OutsideDigest], result: VerifyResult, episode: EpisodeRow | None
+    log: EventLog, digests: Iterable[OutsideDigest], result: findings.VerifyResult, episode: stored.EpisodeRow | None
 ) -> None:
     """Compare the kept digests with digests kept outside of the memory; with `episode`, those of it alone."""
     async with log.snapshot() as connection:
@@ -212,8 +177,10 @@ async def check_outside(
         for each in digests:
             if episode is not None and episode.id != each.id:
                 continue
-            heads = await dialect_of(connection).rows(connection, EpisodeRow, schema.SELECT_HEADS, ids=[(each.id,)])
-            row: EpisodeRow | None = next(iter(heads), None)
+            heads = await dialect_of(connection).rows(
+                connection, stored.EpisodeRow, schema.SELECT_HEADS, ids=[(each.id,)]
+            )
+            row: stored.EpisodeRow | None = next(iter(heads), None)
             if row is None:
                 result.add_damage(
                     None, None, f"episode {each.id} is missing: a digest at event {each.sequence} is given"
@@ -246,8 +213,8 @@ class EpisodeCheck:
 
     def __init__(
         self,
-        episode: EpisodeRow,
-        result: VerifyResult,
+        episode: stored.EpisodeRow,
+        result: findings.VerifyResult,
         designators: Designators,
         rows: Rows,
         descriptions: Collection[str],
@@ -267,7 +234,7 @@ class EpisodeCheck:
         self._lost: int | None = None
         self._open_when_lost: set[int] = set()
 
-    def read(self, span: Span, events: Mapping[int, StoredEvent]) -> None:
+    def read(self, span: stored.Span, events: Mapping[int, stored.StoredEvent]) -> None:
         """Check the events of the next span, given by sequence, and fold those that are visible."""
         episode = self._episode
         for sequence in range(span.after + 1, span.last + 1):
@@ -289,7 +256,7 @@ class EpisodeCheck:
         elif self._ended_wall_ns != episode.ended_wall_ns:
             self._damaged(span.last, f"the episode's ended_wall_ns is {episode.ended_wall_ns}{_OTHER_TIME}")
 
-    def hides(self, difference: TableDifference) -> bool:
+    def hides(self, difference: findings.TableDifference) -> bool:
         """Return whether to suppress a difference, because lost events make its expected row unknown."""
         if self._lost is None:
             return False
@@ -297,7 +264,7 @@ class EpisodeCheck:
         of_whole = difference.table in ("process_metadata", "simulated_episode")
         return difference.sequence >= self._lost or open_then or of_whole
 
-    def _one(self, event: StoredEvent) -> None:
+    def _one(self, event: stored.StoredEvent) -> None:
         shown = event.sequence <= self._episode.folded
         self._result.events += 1
         self._result.behind += not shown
@@ -306,9 +273,9 @@ class EpisodeCheck:
         for reference in references_in(event.type, event.payload):
             self._result.blobs.setdefault(reference.hash, (self._number, event.sequence))
         try:
-            happening = happening_of(event)
+            happening = fold.happening_of(event)
             described = happening.description if isinstance(happening, ObjectAdded) else None
-            self.described = self.described or (described is not None and event.sequence <= BLOCK_EVENTS)
+            self.described = self.described or (described is not None and event.sequence <= stored.BLOCK_EVENTS)
             if described is not None and described not in self._descriptions:
                 self._damaged(event.sequence, f"the description {described} was never declared")
             if self._order is not None:
@@ -318,10 +285,10 @@ class EpisodeCheck:
                     else:
                         self._result.remarks += 1
             if shown and self._lost is None:
-                fold_happening(event, happening, self._designators, self._rows)
+                fold.fold_happening(event, happening, self._designators, self._rows)
         except Exception as reason:  # noqa: BLE001  one event must not end the check of all others
             # An event that is in the tables could be folded once, so the log has changed since.
-            if shown or isinstance(reason, UndecodablePayload) or not isinstance(reason, CannotFold):
+            if shown or isinstance(reason, fold.UndecodablePayload) or not isinstance(reason, CannotFold):
                 self._damaged(
                     event.sequence,
                     f"is in the tables, and cannot be folded: {_named(reason)}" if shown else _named(reason),
@@ -337,7 +304,7 @@ class EpisodeCheck:
             self._open_when_lost = {key.sequence for key in keys if key.number == self._number}
 
     def _damaged(self, sequence: int, reason: str) -> None:
-        self.damaged_blocks.add((sequence - 1) // BLOCK_EVENTS)
+        self.damaged_blocks.add((sequence - 1) // stored.BLOCK_EVENTS)
         self._result.add_damage(self._number, sequence, reason)
 
 
@@ -390,11 +357,11 @@ SELECT number, head, first, last FROM (
 async def verify(
     log: EventLog,
     *,
-    episode: EpisodeRow | None = None,
-    projections: Sequence[Projection] = (),
+    episode: stored.EpisodeRow | None = None,
+    projections: Sequence[custom.Projection] = (),
     digests: Iterable[OutsideDigest] = (),
     report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
-) -> VerifyResult:
+) -> findings.VerifyResult:
     """Verify a whole memory, or one episode.
 
     Args:
@@ -406,8 +373,8 @@ async def verify(
 
     Raises `DatabaseForeign` for tables of a newer version, `DatabaseUnavailable` for a memory without tables.
     """
-    result = VerifyResult()
-    within = EpisodeRange() if episode is None else EpisodeRange(episode.number, episode.number + 1)
+    result = findings.VerifyResult()
+    within = findings.EpisodeRange() if episode is None else findings.EpisodeRange(episode.number, episode.number + 1)
     with log.translated():
         if episode is None:
             await _check_database(log, result)
@@ -419,7 +386,7 @@ async def verify(
         result.not_compared = await uncompared_projections(log, projections)
         compared = [each for each in projections if each.name not in result.not_compared]
         checks = [_TablesCheck(log, result), *(check_of(each, result) for each in compared)]
-        left: EpisodeRange | None = within
+        left: findings.EpisodeRange | None = within
         while left is not None:
             left = await _check_part(log, left, checks, result)
             report_progress(result.events, max(total, result.events))
@@ -428,16 +395,18 @@ async def verify(
 
 
 async def _check_part(
-    log: EventLog, within: EpisodeRange, checks: Sequence[TableCheck], result: VerifyResult
-) -> EpisodeRange | None:
+    log: EventLog, within: findings.EpisodeRange, checks: Sequence[findings.TableCheck], result: findings.VerifyResult
+) -> findings.EpisodeRange | None:
     """Check the next whole episodes in one snapshot; return the range that is left. Raises `DatabaseForeign`."""
     missing = ""
     for _ in range(_ATTEMPTS):
         async with log.snapshot() as connection:
             limits = {"first": within.first, "last": within.limits["end"] - 1, "limit": _PART_EVENTS}
-            episodes = await dialect_of(connection).rows(connection, EpisodeRow, schema.SELECT_EPISODES, **limits)
+            episodes = await dialect_of(connection).rows(
+                connection, stored.EpisodeRow, schema.SELECT_EPISODES, **limits
+            )
             episodes, left = _first_part(episodes, within)
-            part = within if left is None else EpisodeRange(within.first, left.first)
+            part = within if left is None else findings.EpisodeRange(within.first, left.first)
             for check in checks:
                 if not await check.begin(connection, part, episodes):
                     missing = check.missing_table
@@ -457,7 +426,9 @@ async def _check_part(
     raise DatabaseForeign(f"{log.address}: {missing}")
 
 
-def _first_part(episodes: list[EpisodeRow], within: EpisodeRange) -> tuple[list[EpisodeRow], EpisodeRange | None]:
+def _first_part(
+    episodes: list[stored.EpisodeRow], within: findings.EpisodeRange
+) -> tuple[list[stored.EpisodeRow], findings.EpisodeRange | None]:
     """Return the episodes of the next part, at least one if there is any, and the range behind them, if any."""
     events = 0
     for place, row in enumerate(episodes):
@@ -472,15 +443,15 @@ def _first_part(episodes: list[EpisodeRow], within: EpisodeRange) -> tuple[list[
 async def _read_part(
     log: EventLog,
     connection: AsyncConnection,
-    episodes: Sequence[EpisodeRow],
-    checks: Sequence[TableCheck],
-    result: VerifyResult,
+    episodes: Sequence[stored.EpisodeRow],
+    checks: Sequence[findings.TableCheck],
+    result: findings.VerifyResult,
 ) -> None:
     """Give the events of these episodes to the checks, page by page; report those that cannot be read."""
     unreadable: set[int] = set()
-    for page in pages_of([Span(each.number, 0, each.head) for each in episodes], _PAGE_EVENTS):
+    for page in stored.pages_of([stored.Span(each.number, 0, each.head) for each in episodes], _PAGE_EVENTS):
         spans = [each for each in page if each.number not in unreadable]
-        faults: list[Unreadable] = []
+        faults: list[findings.Unreadable] = []
         events = await _readable_events(log, connection, spans, faults)
         by_number = {number: [*each] for number, each in groupby(events, key=attrgetter("number"))}
         ends = {each.number: each.sequence for each in faults}
@@ -496,26 +467,26 @@ async def _read_part(
 
 
 async def _readable_events(
-    log: EventLog, connection: AsyncConnection, spans: Sequence[Span], faults: list[Unreadable]
-) -> list[StoredEvent]:
+    log: EventLog, connection: AsyncConnection, spans: Sequence[stored.Span], faults: list[findings.Unreadable]
+) -> list[stored.StoredEvent]:
     """Read the events of these spans; of an episode with an unreadable one, those before it, and add its fault."""
     try:
         with log.translated():
             async with connection.begin_nested():
                 return await dialect_of(connection).spans(connection, spans)
     except DamageError as fault:
-        if size_of(spans) == 1:
-            faults.append(Unreadable(spans[0].number, spans[0].last, str(fault)))
+        if stored.size_of(spans) == 1:
+            faults.append(findings.Unreadable(spans[0].number, spans[0].last, str(fault)))
             return []
-    events: list[StoredEvent] = []
-    for half in pages_of(spans, (size_of(spans) + 1) // 2):
+    events: list[stored.StoredEvent] = []
+    for half in stored.pages_of(spans, (stored.size_of(spans) + 1) // 2):
         lost = {each.number for each in faults}
         if left := [each for each in half if each.number not in lost]:
             events += await _readable_events(log, connection, left, faults)
     return events
 
 
-async def _check_database(log: EventLog, result: VerifyResult) -> None:
+async def _check_database(log: EventLog, result: findings.VerifyResult) -> None:
     """Check the database's pages, the declarations, and events that belong to no episode."""
     try:
         async with log.snapshot() as connection:
@@ -543,7 +514,7 @@ async def _check_database(log: EventLog, result: VerifyResult) -> None:
         result.add_damage(None, None, str(fault))
 
 
-async def _check_blobs(log: EventLog, result: VerifyResult) -> None:
+async def _check_blobs(log: EventLog, result: findings.VerifyResult) -> None:
     """Compare the content of each blob that an event refers to with its hash."""
     for name, (number, sequence) in result.blobs.items():
         fault = await log.blobs.fault(name)
@@ -564,19 +535,19 @@ async def _numbers_without_episode(connection: AsyncConnection) -> list[int]:
     return numbers
 
 
-async def _stopped(log: EventLog, episode: EpisodeRow | None) -> list[StoppedEpisode]:
+async def _stopped(log: EventLog, episode: stored.EpisodeRow | None) -> list[findings.StoppedEpisode]:
     """Return the parked and refused episodes."""
-    stopped: list[StoppedEpisode] = []
+    stopped: list[findings.StoppedEpisode] = []
     for each in await log.stopped():
         if episode is None or each.number == episode.number:
             if each.refused is not None:
-                stopped.append(StoppedEpisode(each.number, "refused", each.refused))
+                stopped.append(findings.StoppedEpisode(each.number, "refused", each.refused))
             if each.parked is not None:
-                stopped.append(StoppedEpisode(each.number, "parked", each.parked))
+                stopped.append(findings.StoppedEpisode(each.number, "parked", each.parked))
     return stopped
 
 
-async def _check_heads(log: EventLog, within: EpisodeRange, result: VerifyResult) -> int:
+async def _check_heads(log: EventLog, within: findings.EpisodeRange, result: findings.VerifyResult) -> int:
     """Return the number of events that the episodes must have; report events outside of that range."""
     async with log.snapshot() as connection:
         for number, head, lowest, highest in await connection.execute(_BEYOND, within.limits):
@@ -592,17 +563,19 @@ class _TablesCheck:
 
     missing_table = "a table is missing: run `pycrorm rebuild`"
 
-    def __init__(self, log: EventLog, result: VerifyResult) -> None:
+    def __init__(self, log: EventLog, result: findings.VerifyResult) -> None:
         self._log = log
         self._result = result
-        self._comparison: Comparison | None = None
-        self._part = EpisodeRange()
+        self._comparison: findings.Comparison | None = None
+        self._part = findings.EpisodeRange()
         self._rows = Rows()
         self._episodes: dict[int, EpisodeCheck] = {}
         self._digests: dict[int, DigestCheck] = {}
         self._kept: dict[int, dict[int, str]] = {}
 
-    async def begin(self, connection: AsyncConnection, part: EpisodeRange, episodes: Sequence[EpisodeRow]) -> bool:
+    async def begin(
+        self, connection: AsyncConnection, part: findings.EpisodeRange, episodes: Sequence[stored.EpisodeRow]
+    ) -> bool:
         try:
             generation = await current_generation(connection)
         except TablesOutdated as fault:  # check the log alone
@@ -612,7 +585,7 @@ class _TablesCheck:
             raise DatabaseUnavailable(no_tables(self._log.address))
         dialect = dialect_of(connection)
         if self._comparison is None or self._comparison.generation != generation:
-            self._comparison = Comparison(generation, dialect.stored_column)
+            self._comparison = findings.Comparison(generation, dialect.stored_column)
         if self._result.outdated is None and not await dialect.keep(connection, self._comparison.tables):
             return False
         self._part, self._rows, self._episodes, self._digests = part, Rows(), {}, {}
@@ -628,7 +601,7 @@ class _TablesCheck:
                 self._result.add_damage(each.number, fault.sequence, fault.reason)
         return True
 
-    def read(self, span: Span, events: Sequence[StoredEvent]) -> None:
+    def read(self, span: stored.Span, events: Sequence[stored.StoredEvent]) -> None:
         by_sequence = {each.sequence: each for each in events}
         episode, digests = self._episodes[span.number], self._digests.get(span.number)
         episode.read(span, by_sequence)
@@ -644,10 +617,10 @@ class _TablesCheck:
         if self._result.outdated is not None:
             return
         if rows.episodes:
-            name_episodes(rows, await uuids_of(connection, rows.episodes))
+            fold.name_episodes(rows, await fold.uuids_of(connection, rows.episodes))
         differences = await comparison.differences(connection, rows, self._part)
         if rows.descriptions:
-            boxes = await boxes_of(connection, rows.descriptions)
+            boxes = await fold.boxes_of(connection, rows.descriptions)
             differences += await comparison.box_differences(connection, boxes)
         self._result.rows += comparison.count
         for each in sorted(differences, key=attrgetter("number", "sequence")):
@@ -655,7 +628,7 @@ class _TablesCheck:
                 self._result.add_difference(each)
         self._check_superfluous([each for each in differences if each.is_superfluous and each.number])
 
-    def _check_superfluous(self, rows: Iterable[TableDifference]) -> None:
+    def _check_superfluous(self, rows: Iterable[findings.TableDifference]) -> None:
         """Report the events and episodes that the log does not have, although the tables have their rows."""
         last: dict[int, int] = {}
         read = self._episodes
@@ -678,12 +651,16 @@ class _TablesCheck:
 # Compare the tables of a custom projection with the log.
 
 
-def check_of(projection: Projection, result: VerifyResult) -> TableCheck:
+def check_of(projection: custom.Projection, result: findings.VerifyResult) -> findings.TableCheck:
     """Return the check of the tables of this projection."""
-    return projection.check(result) if isinstance(projection, PackedProjection) else ProjectionCheck(projection, result)
+    return (
+        projection.check(result)
+        if isinstance(projection, custom.PackedProjection)
+        else ProjectionCheck(projection, result)
+    )
 
 
-async def uncompared_projections(log: EventLog, projections: Sequence[Projection]) -> dict[str, str]:
+async def uncompared_projections(log: EventLog, projections: Sequence[custom.Projection]) -> dict[str, str]:
     """Return the projections of this memory that cannot be compared, by name, with the reasons."""
     by_name = {each.name: each for each in projections}
     async with log.snapshot() as connection:
@@ -693,7 +670,7 @@ async def uncompared_projections(log: EventLog, projections: Sequence[Projection
     for name, each in generations.items():
         fault = "its code is not installed here"
         if name in by_name:
-            fault = fault_in_version(by_name[name], each, layout_of(by_name[name], dialect)) or ""
+            fault = custom.fault_in_version(by_name[name], each, custom.layout_of(by_name[name], dialect)) or ""
         if fault:
             reasons[name] = fault
     return reasons
@@ -702,48 +679,50 @@ async def uncompared_projections(log: EventLog, projections: Sequence[Projection
 class ProjectionCheck:
     """The check of the tables of one projection. Implements `TableCheck`."""
 
-    def __init__(self, projection: Projection, result: VerifyResult) -> None:
+    def __init__(self, projection: custom.Projection, result: findings.VerifyResult) -> None:
         self._projection = projection
         self.result = result
         name = projection.name
         self.missing_table = f"a table of the projection {name} is missing: run `pycrorm rebuild {name}`"
-        self._comparison: Comparison | None = None
-        self._part = EpisodeRange()
+        self._comparison: findings.Comparison | None = None
+        self._part = findings.EpisodeRange()
         self._folded: dict[int, int] = {}
-        self._refused: dict[int, TableDifference] = {}
+        self._refused: dict[int, findings.TableDifference] = {}
         self._lost: set[int] = set()
 
-    async def begin(self, connection: AsyncConnection, part: EpisodeRange, _: Sequence[EpisodeRow]) -> bool:
+    async def begin(
+        self, connection: AsyncConnection, part: findings.EpisodeRange, _: Sequence[stored.EpisodeRow]
+    ) -> bool:
         dialect, name = dialect_of(connection), self._projection.name
         generation = projections_in(await read_generations(connection)).get(name)
         self._comparison = None
         if generation is None or generation.version != self._projection.version:  # another program has rebuilt it
             return True
-        comparison = Comparison(generation, dialect.stored_column, {})
+        comparison = findings.Comparison(generation, dialect.stored_column, {})
         place = pipeline.place_of(generation.number, name)
         if not await dialect.keep(connection, [*comparison.tables, place]):
             return False
         clauses = "WHERE id >= :first AND id < :end"
         checkpoints = await connection.execute(text(f"SELECT id, folded FROM {place} {clauses}"), part.limits)  # noqa: S608
         self._folded = {each.id: each.folded for each in checkpoints}
-        learn = learner_of(self._projection)
+        learn = custom.learner_of(self._projection)
         batch = learn(generation.layout, await dialect.declarations(connection))[1]
         self._comparison, self._part, self._rows = comparison, part, batch()
         self._refused, self._lost = {}, set()
         return True
 
-    def read(self, span: Span, events: Sequence[StoredEvent]) -> None:
+    def read(self, span: stored.Span, events: Sequence[stored.StoredEvent]) -> None:
         number, after, last = span
         count = min(last, self._folded.get(number, 0)) - after
         if self._comparison is None or number in self._refused or count <= 0:
             return
-        whole = consecutive(events, after)[:count]
+        whole = stored.consecutive(events, after)[:count]
         refused = self._rows.fold(whole) if whole else None
         if refused is None and len(whole) < count:
             refused = after + len(whole) + 1, "it is missing in the log"
         if refused is not None:
             sequence, reason = refused
-            self._refused[number] = TableDifference(
+            self._refused[number] = findings.TableDifference(
                 number, sequence, self._projection.name, "fold", "folded in the tables", f"parked: {reason}"
             )
 
@@ -759,10 +738,10 @@ class ProjectionCheck:
             self.result.add_difference(each._replace(table=each.table.removeprefix(OWN)))
 
     async def differences(
-        self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
-    ) -> Sequence[TableDifference]:
+        self, connection: AsyncConnection, comparison: findings.Comparison, rows: Batch, episodes: findings.EpisodeRange
+    ) -> Sequence[findings.TableDifference]:
         """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
-        assert isinstance(rows, CustomRows)
+        assert isinstance(rows, custom.CustomRows)
         differences = await comparison.differences(connection, rows, episodes)
         self.result.rows += comparison.count
         return differences

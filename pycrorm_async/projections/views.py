@@ -13,29 +13,13 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
-from sqlalchemy import (
-    Column,
-    ColumnElement,
-    Double,
-    Select,
-    Table,
-    TextualSelect,
-    and_,
-    case,
-    cast,
-    column,
-    func,
-    not_,
-    null,
-    or_,
-    select,
-    table,
-    union_all,
-)
+import sqlalchemy as sa
+from sqlalchemy import column, select, table
 from sqlalchemy.sql.selectable import CompoundSelect
 
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
+from pycrorm_async.projections import derived_views
 from pycrorm_async.projections.columns import (
     CORE,
     EPISODE,
@@ -49,20 +33,9 @@ from pycrorm_async.projections.columns import (
     leaf_columns,
     make_table,
 )
-from pycrorm_async.projections.derived_views import (
-    CONCEPT_VIEWS,
-    absent,
-    event_of,
-    member,
-    outcome_of,
-    pick_ups_with_context,
-    root_failures,
-    spatial_relations,
-    world_line,
-)
 from pycrorm_async.world.pose import ObjectType
 
-View: TypeAlias = Select[Any] | CompoundSelect[Any] | TextualSelect
+View: TypeAlias = sa.Select[Any] | CompoundSelect[Any] | sa.TextualSelect
 _Columns: TypeAlias = tuple[tuple[str, Storage], ...]
 
 _UNITED_MAX = 400
@@ -72,7 +45,7 @@ _PICKED = "pick_up_action"
 _PLACED = "place_action"
 
 _declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
-_is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
+_is_description = sa.func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
 
 
 @dataclass(frozen=True)
@@ -89,14 +62,14 @@ class Tables:
     stored: Callable[[str], str]
     simulated: bool = False
 
-    def __getitem__(self, name: str) -> Table:
+    def __getitem__(self, name: str) -> sa.Table:
         """Return a table that every memory has."""
         return make_table(name, CORE.get(name) or OF_NO_EPISODE[name], self.generation, self.stored)
 
-    def leaf(self, name: str, columns: _Columns) -> Table:
+    def leaf(self, name: str, columns: _Columns) -> sa.Table:
         return make_table(name, leaf_columns(dict(columns)), self.generation, self.stored)
 
-    def shown(self, view: Select[Any], rows: Table) -> Select[Any]:
+    def shown(self, view: sa.Select[Any], rows: sa.Table) -> sa.Select[Any]:
         """Return the view without the rows of simulations, unless these views include them."""
         return view if self.simulated else view.where(_happened(rows, self["simulated_episode"]))
 
@@ -140,7 +113,7 @@ def public_views(layout: Layout) -> dict[str, ViewDefinition]:
             views["spatial_relation"] = ViewDefinition(_spatial_relations, (leaves[_PICKED], leaves[_PLACED]))
     views["designator_type"] = ViewDefinition(_designator_type, (layout.unreadable,))
     views["object_description"] = ViewDefinition(_object_description)
-    return {**views, **{name: ViewDefinition(_of_concepts, (name,)) for name in CONCEPT_VIEWS}}
+    return {**views, **{name: ViewDefinition(_of_concepts, (name,)) for name in derived_views.CONCEPT_VIEWS}}
 
 
 def projection_views(layout: Layout, number: int, tables: Tables) -> dict[str, View]:
@@ -165,12 +138,12 @@ def _cut(tables: Tables, name: str) -> View:
 
 def _pick_ups_with_context(tables: Tables, picked: _Leaf, dtypes: tuple[str, ...]) -> View:
     rows = _with_simulations(tables, picked).subquery("picked")
-    return tables.shown(pick_ups_with_context(tables, rows, dtypes), tables["task_tree_node"])
+    return tables.shown(derived_views.pick_ups_with_context(tables, rows, dtypes), tables["task_tree_node"])
 
 
 def _spatial_relations(tables: Tables, picked: _Leaf, placed: _Leaf) -> View:
     rows = [_with_simulations(tables, each).subquery(name) for each, name in ((picked, "picked"), (placed, "placed"))]
-    return spatial_relations(tables, *rows, simulated=tables.simulated)
+    return derived_views.spatial_relations(tables, *rows, simulated=tables.simulated)
 
 
 def _with_simulations(tables: Tables, leaf: _Leaf) -> View:
@@ -182,57 +155,59 @@ def _object_description(_tables: Tables) -> View:
 
 
 def _of_concepts(_tables: Tables, name: str) -> View:
-    return CONCEPT_VIEWS[name]()
+    return derived_views.CONCEPT_VIEWS[name]()
 
 
-def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
+def _happened(rows: sa.Table, simulations: sa.Table) -> sa.ColumnElement[bool]:
     """Return the condition that a row does not belong to a simulation."""
     if rows.info[MARKED]:
         return ~rows.c.simulated
-    return absent(rows.c[EPISODE], simulations.c.id)
+    return derived_views.absent(rows.c[EPISODE], simulations.c.id)
 
 
-def _process_metadata(tables: Tables) -> Select[Any]:
+def _process_metadata(tables: Tables) -> sa.Select[Any]:
     episodes = tables["process_metadata"]
-    world = func.coalesce(episodes.c.world, episodes.c.entered_world, world_line(tables, episodes.c.id)).label("world")
+    world = sa.func.coalesce(
+        episodes.c.world, episodes.c.entered_world, derived_views.world_line(tables, episodes.c.id)
+    ).label("world")
     columns = columns_in_order(episodes)
     first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
     return select(first, *others, _end(episodes.c.created_at, episodes).label("ended_at"), _duration_s(episodes))
 
 
-def _episode_tag(tables: Tables) -> Select[Any]:
+def _episode_tag(tables: Tables) -> sa.Select[Any]:
     """Return the tags that episodes have now: those whose last change added them."""
     changes = tables["episode_tagging"]
     later = changes.alias("later")
-    is_later = and_(
+    is_later = sa.and_(
         later.c.process_metadata_id == changes.c.process_metadata_id,
         later.c.tag == changes.c.tag,
-        or_(later.c.id > changes.c.id, and_(later.c.id == changes.c.id, later.c.position > changes.c.position)),
+        sa.or_(later.c.id > changes.c.id, sa.and_(later.c.id == changes.c.id, later.c.position > changes.c.position)),
     )
     columns = changes.c.id, changes.c.process_metadata_id, changes.c.tag, changes.c.time
     return select(*columns, *_sequence(changes)).where(
-        changes.c.added, not_(select(later.c.id).where(is_later).exists())
+        changes.c.added, sa.not_(select(later.c.id).where(is_later).exists())
     )
 
 
-def _episode_robot(tables: Tables) -> Select[Any]:
+def _episode_robot(tables: Tables) -> sa.Select[Any]:
     """Return the robots of episodes, each once, however often it was added: with the row of the first time."""
     rows = tables["object"]
     robot = rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial, rows.c.description_fingerprint
-    first = func.min(rows.c.id)
-    robots = select(first.label("id"), *robot, event_of(first).label("sequence")).group_by(*robot)
+    first = sa.func.min(rows.c.id)
+    robots = select(first.label("id"), *robot, derived_views.event_of(first).label("sequence")).group_by(*robot)
     return robots.where(rows.c.obj_type == ObjectType.ROBOT.name, rows.c.id == rows.c.identity_id)
 
 
 def _designator_type(_tables: Tables, unreadable_declarations: tuple[str, ...]) -> View:
     """Return the view of declarations. It never parses one that is not JSON, whichever column a query reads."""
-    payload: ColumnElement[Any] = _declaration.c.payload
+    payload: sa.ColumnElement[Any] = _declaration.c.payload
     if unreadable_declarations:
         unreadable = _declaration.c.fingerprint.in_(unreadable_declarations)
-        payload = case((unreadable, "{}"), else_=payload)
+        payload = sa.case((unreadable, "{}"), else_=payload)
 
-    def of_payload(name: str) -> ColumnElement[Any]:
-        return member(payload, name)
+    def of_payload(name: str) -> sa.ColumnElement[Any]:
+        return derived_views.member(payload, name)
 
     view = select(
         _declaration.c.fingerprint,
@@ -240,43 +215,43 @@ def _designator_type(_tables: Tables, unreadable_declarations: tuple[str, ...]) 
         of_payload("kind").label("kind"),
         of_payload("table").label("leaf"),
         of_payload("concept").label("concept"),
-        func.coalesce(of_payload("fields"), "[]").label("fields"),
+        sa.func.coalesce(of_payload("fields"), "[]").label("fields"),
     )
     view = view.where(~_is_description)
     return view.where(~unreadable) if unreadable_declarations else view
 
 
-def _task_tree_node(tables: Tables) -> Select[Any]:
+def _task_tree_node(tables: Tables) -> sa.Select[Any]:
     nodes = tables["task_tree_node"]
-    action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
+    action_id = sa.case((nodes.c.dtype.is_not(None), nodes.c.id), else_=sa.null())
     columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
-    outcome = outcome_of(nodes).label("outcome")
+    outcome = derived_views.outcome_of(nodes).label("outcome")
     return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome)
 
 
-def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
+def _sequence(rows: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
     """Return the column `sequence` of rows: the sequence of the event in the id that their key begins with."""
     first, *_ = rows.primary_key.columns
-    return (event_of(first).label("sequence"),)
+    return (derived_views.event_of(first).label("sequence"),)
 
 
-def _duration_s(rows: Table) -> ColumnElement[Any]:
+def _duration_s(rows: sa.Table) -> sa.ColumnElement[Any]:
     """Return the column `duration_s` by the monotonic clock; null without an end: while it runs, and of a LOST node."""
-    return (cast(rows.c.end_ns - rows.c.start_ns, Double()) / 1e9).label("duration_s")
+    return (sa.cast(rows.c.end_ns - rows.c.start_ns, sa.Double()) / 1e9).label("duration_s")
 
 
-def _end(start: ColumnElement[int], rows: Table) -> ColumnElement[int]:
+def _end(start: sa.ColumnElement[int], rows: sa.Table) -> sa.ColumnElement[int]:
     """Return the end in µs: the start and the duration, because the wall clock may be set between the two."""
     return start + (rows.c.end_ns - rows.c.start_ns) // 1000
 
 
-def _end_and_durations(nodes: Table) -> tuple[ColumnElement[Any], ...]:
+def _end_and_durations(nodes: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
     """Return the columns of the end of a node; `duration` is the former name of `duration_s`."""
     duration = _duration_s(nodes)
     return _end(nodes.c.start_time, nodes).label("end_time"), duration, duration.element.label("duration")
 
 
-def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
+def _course(nodes: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
     """Return the columns of a node's course: start and end by time and by event, robot, parent, and outcome."""
     times = nodes.c.start_time, *_end_and_durations(nodes)
     ended = nodes.c.reason, nodes.c.failure_message, nodes.c.result
@@ -285,18 +260,18 @@ def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
 
 def _designator(tables: Tables, unusual_lineages: tuple[tuple[str, str], ...]) -> View:
     nodes = tables["task_tree_node"]
-    robot_state_id = case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=null())
-    kind = case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
-    lineage: ColumnElement[str] = nodes.c.dtype.concat(kind)
+    robot_state_id = sa.case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=sa.null())
+    kind = sa.case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
+    lineage: sa.ColumnElement[str] = nodes.c.dtype.concat(kind)
     if unusual_lineages:
-        lineage = case(dict(unusual_lineages), value=nodes.c.dtype, else_=lineage)
+        lineage = sa.case(dict(unusual_lineages), value=nodes.c.dtype, else_=lineage)
     view = select(
         nodes.c.id,
         nodes.c.process_metadata_id,
         nodes.c.dtype,
         nodes.c.kind,
         robot_state_id.label("robot_state_id"),
-        func.coalesce(nodes.c.parameters, "{}").label("parameters"),
+        sa.func.coalesce(nodes.c.parameters, "{}").label("parameters"),
         lineage.label("lineage"),
         *_course(nodes),
     ).where(nodes.c.dtype.is_not(None))
@@ -309,17 +284,17 @@ def _unusual_lineages(layout: Layout) -> tuple[tuple[str, str], ...]:
     return tuple((dtype, layout.lineage(dtype)) for dtype in dict.fromkeys((*unusual, *layout.renamed)))
 
 
-def _of_kind(kind: str) -> Callable[[Tables], Select[Any]]:
-    def view(tables: Tables) -> Select[Any]:
+def _of_kind(kind: str) -> Callable[[Tables], sa.Select[Any]]:
+    def view(tables: Tables) -> sa.Select[Any]:
         nodes = tables["task_tree_node"]
-        parameters = func.coalesce(nodes.c.parameters, "{}").label("parameters")
+        parameters = sa.func.coalesce(nodes.c.parameters, "{}").label("parameters")
         columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes), parameters
         return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
 
     return view
 
 
-def _robot_state(tables: Tables) -> Select[Any]:
+def _robot_state(tables: Tables) -> sa.Select[Any]:
     nodes = tables["task_tree_node"]
     return select(
         nodes.c.id,
@@ -331,30 +306,32 @@ def _robot_state(tables: Tables) -> Select[Any]:
     ).where(nodes.c.robot_pose_id.is_not(None))
 
 
-def _root_failure(tables: Tables) -> Select[Any]:
+def _root_failure(tables: Tables) -> sa.Select[Any]:
     nodes = tables["task_tree_node"]
-    return root_failures(tables).add_columns(_end(nodes.c.start_time, nodes).label("end_time"), _duration_s(nodes))
+    return derived_views.root_failures(tables).add_columns(
+        _end(nodes.c.start_time, nodes).label("end_time"), _duration_s(nodes)
+    )
 
 
-def _pose(tables: Tables) -> Select[Any]:
+def _pose(tables: Tables) -> sa.Select[Any]:
     poses = tables["pose"]
     return select(
         *columns_in_order(poses), *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id")
     )
 
 
-def _position(tables: Tables) -> Select[Any]:
+def _position(tables: Tables) -> sa.Select[Any]:
     poses = tables["pose"]
     return select(poses.c.id, poses.c.process_metadata_id, poses.c.x, poses.c.y, poses.c.z)
 
 
-def _quaternion(tables: Tables) -> Select[Any]:
+def _quaternion(tables: Tables) -> sa.Select[Any]:
     poses = tables["pose"]
     parts = (poses.c[f"q{axis}"].label(axis) for axis in "xyzw")
     return select(poses.c.id, poses.c.process_metadata_id, *parts)
 
 
-_CUT: dict[str, tuple[str, Callable[[Tables], Select[Any]]]] = {
+_CUT: dict[str, tuple[str, Callable[[Tables], sa.Select[Any]]]] = {
     "process_metadata": ("process_metadata", _process_metadata),
     "episode_tag": ("episode_tagging", _episode_tag),
     "episode_robot": ("object", _episode_robot),
@@ -376,10 +353,10 @@ def _united_rows(tables: Tables, leaf: _Leaf) -> View:
     parts = []
     for member_name, member_columns in leaf.members:
         rows, own = tables.leaf(member_name, member_columns), dict(member_columns)
-        columns: list[ColumnElement[Any]] = [rows.c.id]
+        columns: list[sa.ColumnElement[Any]] = [rows.c.id]
         for each, storage in leaf.columns:
             same = own.get(each) == storage
-            columns.append(_labelled(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
+            columns.append(_labelled(rows.c[each]) if same else sa.cast(sa.null(), column_type(storage)).label(each))
         columns += [rows.c[EPISODE]]
         if all(name != "sequence" for name, _ in leaf.columns):
             columns += _sequence(rows)
@@ -387,14 +364,14 @@ def _united_rows(tables: Tables, leaf: _Leaf) -> View:
     return _united(parts)
 
 
-def _united(parts: Sequence[Select[Any]]) -> View:
+def _united(parts: Sequence[sa.Select[Any]]) -> View:
     """Return the union of these selects, which have the same columns."""
     while len(parts) > _UNITED_MAX:
         groups = [parts[first : first + _UNITED_MAX] for first in range(0, len(parts), _UNITED_MAX)]
-        parts = [select(union_all(*each).subquery()) for each in groups]
-    return parts[0] if len(parts) == 1 else union_all(*parts)
+        parts = [select(sa.union_all(*each).subquery()) for each in groups]
+    return parts[0] if len(parts) == 1 else sa.union_all(*parts)
 
 
-def _labelled(column: Column[Any]) -> ColumnElement[Any]:
+def _labelled(column: sa.Column[Any]) -> sa.ColumnElement[Any]:
     """Return the column under its name in the view."""
     return column if column.name == column.key else column.label(column.key)

@@ -42,16 +42,9 @@ from sqlalchemy import inspect as inspect_row
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.plan import objects
 from pycrorm_async.plan.field_types import ARGUMENTS
 from pycrorm_async.plan.language import Designator
-from pycrorm_async.plan.objects import (
-    BelieveObject,
-    LocatedObject,
-    ObjectDesignator,
-    ObjectPart,
-    designator_of,
-    require_world,
-)
 from pycrorm_async.projections.row_batch import is_missing
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.record.declarations import FieldShape, shape_of
@@ -262,27 +255,37 @@ def _pose_of_entry(entry: orm.ParameterItem) -> Pose:
     return Pose(position_and_orientation[:3], position_and_orientation[3:], entry.frame or "map")
 
 
-def _object(row: orm.Object, hint: Any) -> Object | ObjectDesignator:
+def _object(row: orm.Object, hint: Any) -> Object | objects.ObjectDesignator:
     """Return an object of the current world if the row is that of a world's object; otherwise a designator."""
     if row.identity_id is not None:
-        present = require_world().object(row.name)
+        present = objects.require_world().object(row.name)
         accepted = (hint, *typing.get_args(hint))
-        return present if Object in accepted and ObjectDesignator not in accepted else designator_of(present)
+        return (
+            present
+            if Object in accepted and objects.ObjectDesignator not in accepted
+            else objects.designator_of(present)
+        )
     if isinstance(row, orm.ObjectPart) and row.part_of is not None:
-        return ObjectPart(row.name, require_world().object(row.part_of.name), _object_type(row.name, row.obj_type))
+        return objects.ObjectPart(
+            row.name, objects.require_world().object(row.part_of.name), _object_type(row.name, row.obj_type)
+        )
     if row.pose is None:
         raise NotPerformable(_WITHOUT_POSE.format(row.name))
     pose = _pose(row.pose)
     kind = _object_type(row.name, row.obj_type)
     if isinstance(row, orm.LocatedObject) and row.reference is not None and row.reference.pose is not None:
-        reference = require_world().object(row.reference.name)
+        reference = objects.require_world().object(row.reference.name)
         relative = pose.relative_to(_pose(row.reference.pose))
-        return LocatedObject(row.name, kind, relative, reference, row.pose.time)
-    return BelieveObject(row.name, kind, pose) if isinstance(row, orm.BelieveObject) else _frozen(row.name, kind, pose)
+        return objects.LocatedObject(row.name, kind, relative, reference, row.pose.time)
+    return (
+        objects.BelieveObject(row.name, kind, pose)
+        if isinstance(row, orm.BelieveObject)
+        else _frozen(row.name, kind, pose)
+    )
 
 
-def _frozen(name: str, kind: ObjectType | str | None, pose: Pose) -> ObjectDesignator:
-    return ObjectDesignator(name, _object_type(name, kind), None, pose)
+def _frozen(name: str, kind: ObjectType | str | None, pose: Pose) -> objects.ObjectDesignator:
+    return objects.ObjectDesignator(name, _object_type(name, kind), None, pose)
 
 
 def _object_type(name: str, kind: ObjectType | str | None) -> ObjectType:

@@ -26,36 +26,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 import msgspec
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    ColumnElement,
-    CompoundSelect,
-    Date,
-    DateTime,
-    Double,
-    Enum,
-    Float,
-    Integer,
-    LargeBinary,
-    Numeric,
-    Select,
-    String,
-    Text,
-    TextClause,
-    TextualSelect,
-    True_,
-    case,
-    cast,
-    false,
-    func,
-    inspect,
-    literal,
-    or_,
-    select,
-    true,
-    type_coerce,
-)
+import sqlalchemy as sa
+from sqlalchemy import ColumnElement
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.ext.hybrid import HybridExtensionType
 from sqlalchemy.orm import Mapper
@@ -82,7 +54,7 @@ EpisodeNumber: TypeAlias = "int | ColumnElement[int] | Sequence[int]"
 """The number of an episode, an expression that finds it, or the numbers of several."""
 
 E = TypeVar("E", bound=EnumMember)
-_STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
+_STATEMENT = TypeVar("_STATEMENT", bound=sa.Select[Any])
 
 _CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 
@@ -100,7 +72,7 @@ def of_episode(column: Any, episode: Any) -> ColumnElement[bool]:
     have no gaps.
     """
     if episode is None:
-        return true()
+        return sa.true()
     if not isinstance(episode, Sequence):
         same: ColumnElement[bool] = column == episode
         return same
@@ -110,28 +82,30 @@ def of_episode(column: Any, episode: Any) -> ColumnElement[bool]:
             ranges[-1][1] = number
         else:
             ranges.append([number, number])
-    return or_(false(), *(column == first if first == last else column.between(first, last) for first, last in ranges))
+    return sa.or_(
+        sa.false(), *(column == first if first == last else column.between(first, last) for first, last in ranges)
+    )
 
 
 def equal(column: Any, value: Any) -> ColumnElement[bool]:
     """Return the condition that the column has this value; for None every row fulfils it."""
-    same: ColumnElement[bool] = true() if value is None else column == value
+    same: ColumnElement[bool] = sa.true() if value is None else column == value
     return same
 
 
 def needed(*conditions: ColumnElement[bool]) -> list[ColumnElement[bool]]:
     """Return the conditions without those that every row fulfils, for a select that may have no others."""
-    return [each for each in conditions if not isinstance(each, True_)]
+    return [each for each in conditions if not isinstance(each, sa.True_)]
 
 
 def json_text(document: Any, name: str) -> ColumnElement[str]:
     """Return the member of this name of a column of JSON as text; SQLite alone would return a number as a number."""
-    return cast(member(document, name), Text)
+    return sa.cast(member(document, name), sa.Text)
 
 
 def times_with(condition: Any) -> ColumnElement[int]:
     """Return the number of rows of a group that fulfil the condition."""
-    return cast(func.coalesce(func.sum(case((condition, 1), else_=0)), 0), Integer)
+    return sa.cast(sa.func.coalesce(sa.func.sum(sa.case((condition, 1), else_=0)), 0), sa.Integer)
 
 
 def success_rate(status: Any, among: Any) -> tuple[ColumnElement[float], ...]:
@@ -139,21 +113,24 @@ def success_rate(status: Any, among: Any) -> tuple[ColumnElement[float], ...]:
 
     Only rows that fulfil `among` count; all three are null without one. `query.success.interval_95` computes the same.
     """
-    tries = func.nullif(cast(times_with(among), Double), 0.0)
-    share = func.avg(case((status == TaskStatus.SUCCEEDED, 1.0), (among, 0.0)))
+    tries = sa.func.nullif(sa.cast(times_with(among), sa.Double), 0.0)
+    share = sa.func.avg(sa.case((status == TaskStatus.SUCCEEDED, 1.0), (among, 0.0)))
     spread = NORMAL_95 * NORMAL_95 / tries
-    half = NORMAL_95 * func.sqrt(share * (1 - share) / tries + spread / (4 * tries))
-    low = case((share == 0, 0.0), else_=(share + spread / 2 - half) / (1 + spread))
-    high = case((share == 1, 1.0), else_=(share + spread / 2 + half) / (1 + spread))
-    rate = (("share", share), ("low", case((tries > 0, low))), ("high", case((tries > 0, high))))
-    return tuple(cast(value, Double).label(name) for name, value in rate)
+    half = NORMAL_95 * sa.func.sqrt(share * (1 - share) / tries + spread / (4 * tries))
+    low = sa.case((share == 0, 0.0), else_=(share + spread / 2 - half) / (1 + spread))
+    high = sa.case((share == 1, 1.0), else_=(share + spread / 2 + half) / (1 + spread))
+    rate = (("share", share), ("low", sa.case((tries > 0, low))), ("high", sa.case((tries > 0, high))))
+    return tuple(sa.cast(value, sa.Double).label(name) for name, value in rate)
 
 
 def containing(text: str, *columns: Any) -> ColumnElement[bool]:
     """Return the condition that one of the columns contains the text, in upper or lower case; see `is_named`."""
     escaped = re.sub("[/%_]", r"/\g<0>", text)
-    return or_(
-        *(func.lower(cast(each, Text)).contains(func.lower(literal(escaped, Text)), escape="/") for each in columns)
+    return sa.or_(
+        *(
+            sa.func.lower(sa.cast(each, sa.Text)).contains(sa.func.lower(sa.literal(escaped, sa.Text)), escape="/")
+            for each in columns
+        )
     )
 
 
@@ -163,7 +140,7 @@ def is_named(column: Any, name: str) -> ColumnElement[bool]:
     The database lowers both, because its rule for letters differs from Python's: SQLite lowers only A to Z, so that
     other letters are compared as they are written; PostgreSQL lowers those that the locale of the database has.
     """
-    return func.lower(column) == func.lower(literal(name, Text))
+    return sa.func.lower(column) == sa.func.lower(sa.literal(name, sa.Text))
 
 
 def limited(statement: _STATEMENT, limit: int | None) -> _STATEMENT:
@@ -243,7 +220,7 @@ def arrow_type(kind: ColumnKind, *, enums_as_text: bool = False) -> pa.DataType 
 
 async def arrow_batches(
     connection: AsyncConnection,
-    statement: Select[*tuple[Any, ...]],
+    statement: sa.Select[*tuple[Any, ...]],
     columns: Sequence[FrameColumn],
     *,
     rows: int = BATCH_ROWS,
@@ -306,19 +283,19 @@ ColumnKind: TypeAlias = Literal[
 """The type of a column as far as frames and files distinguish it. `local time` is one without a time zone."""
 
 _KINDS: tuple[tuple[type[TypeEngine[Any]], ColumnKind, TypeEngine[Any] | None], ...] = (
-    (Moment, "time", BigInteger()),
-    (EnumName, "enum", String()),
-    (ClassOfRow, "text", String()),
-    (JsonText, "json", Text()),
-    (Boolean, "bool", None),
-    (Integer, "integer", None),
-    (Float, "number", None),
-    (Numeric, "number", Double()),
-    (Enum, "enum", String()),
-    (String, "text", None),
-    (LargeBinary, "bytes", None),
-    (DateTime, "local time", None),
-    (Date, "date", None),
+    (Moment, "time", sa.BigInteger()),
+    (EnumName, "enum", sa.String()),
+    (ClassOfRow, "text", sa.String()),
+    (JsonText, "json", sa.Text()),
+    (sa.Boolean, "bool", None),
+    (sa.Integer, "integer", None),
+    (sa.Float, "number", None),
+    (sa.Numeric, "number", sa.Double()),
+    (sa.Enum, "enum", sa.String()),
+    (sa.String, "text", None),
+    (sa.LargeBinary, "bytes", None),
+    (sa.DateTime, "local time", None),
+    (sa.Date, "date", None),
 )
 """The kind of each SQLAlchemy type, and the type as which it is read in place of its own Python values."""
 
@@ -331,15 +308,15 @@ class FrameColumn(NamedTuple):
     kind: ColumnKind
 
 
-def select_of(query: object) -> Select[*tuple[Any, ...]]:
+def select_of(query: object) -> sa.Select[*tuple[Any, ...]]:
     """Return the select of a `FrameQuery` except a question. Raises `CallerError` for anything else."""
-    if isinstance(query, Select):
+    if isinstance(query, sa.Select):
         return query
-    if isinstance(query, CompoundSelect):
-        return select(query.subquery())
-    if isinstance(query, type) and getattr(inspect(query, raiseerr=False), "is_mapper", False):
-        return select(query)
-    if isinstance(query, str | TextClause | TextualSelect):
+    if isinstance(query, sa.CompoundSelect):
+        return sa.select(query.subquery())
+    if isinstance(query, type) and getattr(sa.inspect(query, raiseerr=False), "is_mapper", False):
+        return sa.select(query)
+    if isinstance(query, str | sa.TextClause | sa.TextualSelect):
         raise CallerError(
             "a frame has the types that a select declares, and SQL as text declares none:"
             " `(await memory.query(sql)).frame()` has those of its values"
@@ -347,14 +324,14 @@ def select_of(query: object) -> Select[*tuple[Any, ...]]:
     raise CallerError(f"a frame can be of a select, a mapped class or a question, not of {query!r:.100}")
 
 
-def columns_of(statement: Select[*tuple[Any, ...]], *, deferred: bool = False) -> list[FrameColumn]:
+def columns_of(statement: sa.Select[*tuple[Any, ...]], *, deferred: bool = False) -> list[FrameColumn]:
     """Return the columns of a select over columns, mapped classes, views, or a mix; with `deferred`, those too."""
     return list(_distinct(_columns(statement, deferred=deferred)))
 
 
-def _columns(statement: Select[*tuple[Any, ...]], *, deferred: bool) -> Iterator[FrameColumn]:
+def _columns(statement: sa.Select[*tuple[Any, ...]], *, deferred: bool) -> Iterator[FrameColumn]:
     for each in statement.column_descriptions:
-        entity = inspect(each["expr"], raiseerr=False)
+        entity = sa.inspect(each["expr"], raiseerr=False)
         if not (getattr(entity, "is_mapper", False) or getattr(entity, "is_aliased_class", False)):
             yield _column(each["name"], each["expr"], each["type"])
             continue
@@ -375,15 +352,15 @@ def _attributes(mapper: Mapper[Any], *, deferred: bool) -> Iterator[tuple[str, T
         if shown is not None and (deferred or not shown.deferred):
             yield name, shown.columns[0].type
         elif name == "sequence":  # computed from the id
-            yield name, BigInteger()
+            yield name, sa.BigInteger()
 
 
 def _column(name: str, expression: Any, type_: Any) -> FrameColumn:
     if _is_mean(expression):
-        return FrameColumn(name, type_coerce(expression, Double()), "number")
+        return FrameColumn(name, sa.type_coerce(expression, sa.Double()), "number")
     for types, kind, read_as in _KINDS:
         if isinstance(type_, types):
-            return FrameColumn(name, expression if read_as is None else type_coerce(expression, read_as), kind)
+            return FrameColumn(name, expression if read_as is None else sa.type_coerce(expression, read_as), kind)
     return FrameColumn(name, expression, "untyped")
 
 
@@ -410,7 +387,11 @@ Library: TypeAlias = Literal["pandas", "polars", "arrow"]
 
 
 async def dataframe(
-    connection: AsyncConnection, statement: Select[*tuple[Any, ...]], *, to: Library = "pandas", deferred: bool = False
+    connection: AsyncConnection,
+    statement: sa.Select[*tuple[Any, ...]],
+    *,
+    to: Library = "pandas",
+    deferred: bool = False,
 ) -> Any:
     """Return the rows of a select over columns, mapped classes, views, or a mix.
 

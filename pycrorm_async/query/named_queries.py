@@ -13,32 +13,13 @@ from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, or_, sele
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession
 from sqlalchemy.orm import aliased
 
+from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
 from pycrorm_async.events.types import LocationResolved, ObjectDetected
-from pycrorm_async.orm import (
-    Designator,
-    Detection,
-    EpisodeRobot,
-    EpisodeTag,
-    LocationRefusal,
-    LocationResolution,
-    Object,
-    Observation,
-    Pose,
-    ProcessMetaData,
-    TaskTreeNode,
-)
 from pycrorm_async.orm.base import same_row
-from pycrorm_async.query.frames import (
-    check_texts,
-    containing,
-    limited,
-    member_of,
-    needed,
-    of_episode,
-    times_with,
-)
+from pycrorm_async.query import frames
+from pycrorm_async.query.frames import of_episode
 from pycrorm_async.query.running_episodes import RobotSummary, robots_of
 from pycrorm_async.query.text import NotebookValue, with_object_names
 from pycrorm_async.store.log import number_named
@@ -171,8 +152,8 @@ class NodeSummary:
     outcome: str | None = field(default=None, compare=False)
 
 
-_OF_EPISODE = {each.name for each in fields(EpisodeSummary)} & {*ProcessMetaData.__table__.c.keys()}
-_OF_NODE = {each.name for each in fields(NodeSummary)} & {*TaskTreeNode.__table__.c.keys()}
+_OF_EPISODE = {each.name for each in fields(EpisodeSummary)} & {*orm.ProcessMetaData.__table__.c.keys()}
+_OF_NODE = {each.name for each in fields(NodeSummary)} & {*orm.TaskTreeNode.__table__.c.keys()}
 _OF_EPISODE -= {"id", "thought_by"}
 _OF_NODE -= {"status"}
 """The fields that are columns of the same name."""
@@ -192,18 +173,18 @@ async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | No
 
 async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> list[EpisodeSummary]:
     """Return the episodes with these numbers, by number."""
-    episode = ProcessMetaData.__table__
+    episode = orm.ProcessMetaData.__table__
     query = select(episode).where(episode.c.id.in_(numbers)).order_by(episode.c.id)
     rows = (await connection.execute(query)).all()
     simulating = await _simulating_nodes(connection, rows)
     robots = await robots_of(connection, numbers)
     tags: dict[int, list[str]] = {}
-    tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
-    for number, tag in await connection.execute(tagged.where(EpisodeTag.process_metadata_id.in_(numbers))):
+    tagged = select(orm.EpisodeTag.process_metadata_id, orm.EpisodeTag.tag).order_by(orm.EpisodeTag.tag)
+    for number, tag in await connection.execute(tagged.where(orm.EpisodeTag.process_metadata_id.in_(numbers))):
         tags.setdefault(number, []).append(tag)
-    node = TaskTreeNode
-    ended_badly = times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST]))
-    raised = times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR]) & (node.kind == "action"))
+    node = orm.TaskTreeNode
+    ended_badly = frames.times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST]))
+    raised = frames.times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR]) & (node.kind == "action"))
     counted = select(node.process_metadata_id, func.count(), ended_badly, raised).group_by(node.process_metadata_id)
     counts = {row[0]: row[1:] for row in await connection.execute(counted.where(node.process_metadata_id.in_(numbers)))}
     return [
@@ -230,7 +211,7 @@ async def _simulating_nodes(connection: AsyncConnection, episodes: Sequence[Row[
     simulated = [each for each in episodes if each.thought_by is not None]
     if not simulated:
         return {}
-    episode, node = ProcessMetaData, TaskTreeNode
+    episode, node = orm.ProcessMetaData, orm.TaskTreeNode
     named = select(episode.uuid, episode.id).where(episode.uuid.in_({each.thought_by for each in simulated}))
     numbers: dict[str, int] = {row[0]: row[1] for row in await connection.execute(named)}
     ids = {
@@ -258,7 +239,7 @@ async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummar
 
     Raises `UnknownEpisode`, also when several ids have these first digits.
     """
-    episode = ProcessMetaData
+    episode = orm.ProcessMetaData
     last = select(func.max(episode.id)).where(~episode.simulated)
     number = (await connection.execute(last)).scalar() if name == "last" else None
     if number is None:
@@ -270,7 +251,7 @@ async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummar
 
 def nodes_of(number: int) -> Select[*tuple[Any, ...]]:
     """Return the select of an episode's nodes with their parameters."""
-    table, designator = TaskTreeNode.__table__, Designator.__table__
+    table, designator = orm.TaskTreeNode.__table__, orm.Designator.__table__
     return (
         select(table, designator.c.parameters)
         .outerjoin(designator, same_row(designator, table))
@@ -281,17 +262,17 @@ def nodes_of(number: int) -> Select[*tuple[Any, ...]]:
 
 async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummary]:
     """Return the nodes of an episode, each before its children, children in the order in which they started."""
-    objects = Object.__table__
+    objects = orm.Object.__table__
     named = select(objects.c.id, objects.c.name).where(objects.c.process_metadata_id == number)
     names = {row.id: row.name for row in await connection.execute(named)}
     simulations = await _simulations_by_node(connection, number)
-    counted = select(Observation.node_id, func.count()).where(Observation.process_metadata_id == number)
-    observations = dict(iter(await connection.execute(counted.group_by(Observation.node_id))))
-    seen = select(Detection.node_id, func.count()).where(Detection.process_metadata_id == number)
-    detected = dict(iter(await connection.execute(seen.group_by(Detection.node_id))))
-    sums = func.sum(LocationResolution.considered), func.sum(LocationResolution.offered)
-    searched = select(LocationResolution.node_id, *sums).where(LocationResolution.process_metadata_id == number)
-    places = {row[0]: row[1:] for row in await connection.execute(searched.group_by(LocationResolution.node_id))}
+    counted = select(orm.Observation.node_id, func.count()).where(orm.Observation.process_metadata_id == number)
+    observations = dict(iter(await connection.execute(counted.group_by(orm.Observation.node_id))))
+    seen = select(orm.Detection.node_id, func.count()).where(orm.Detection.process_metadata_id == number)
+    detected = dict(iter(await connection.execute(seen.group_by(orm.Detection.node_id))))
+    sums = func.sum(orm.LocationResolution.considered), func.sum(orm.LocationResolution.offered)
+    searched = select(orm.LocationResolution.node_id, *sums).where(orm.LocationResolution.process_metadata_id == number)
+    places = {row[0]: row[1:] for row in await connection.execute(searched.group_by(orm.LocationResolution.node_id))}
     children: dict[int | None, list[NodeSummary]] = {}
     for row in await connection.execute(nodes_of(number)):
         parameters = with_object_names(
@@ -319,7 +300,7 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
 
 async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
     """Return the numbers of the simulations of this episode, by the id of the node that performed them."""
-    simulating_episode, simulation = aliased(ProcessMetaData), ProcessMetaData
+    simulating_episode, simulation = aliased(orm.ProcessMetaData), orm.ProcessMetaData
     own = select(simulating_episode.uuid).where(simulating_episode.id == number).scalar_subquery()
     query = (
         select(simulation.id, simulation.thought_by_node)
@@ -370,16 +351,16 @@ class EpisodeChoice:
     ids: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        check_texts({"status": self.status, "robot": self.robot, "text": self.text})
+        frames.check_texts({"status": self.status, "robot": self.robot, "text": self.text})
         for each in (*self.tags, *self.without_tags):
-            check_texts({"tag": each})
+            frames.check_texts({"tag": each})
         if self.since is not None and not isinstance(self.since, datetime):
             raise CallerError(f"since must be a datetime with a time zone, got {self.since!r}")
         if self.since is not None and self.since.tzinfo is None:
             raise CallerError(f"since has no time zone: {self.since.isoformat()}")
         # Both are built again for each query; here they raise where the choice is made.
         self.conditions()
-        limited(select(), self.limit)
+        frames.limited(select(), self.limit)
 
     def __str__(self) -> str:
         """Return the conditions as `status FAILED; tags night, kitchen; the newest 10`; empty if there is none."""
@@ -396,13 +377,13 @@ class EpisodeChoice:
 
     def conditions(self) -> list[ColumnElement[bool]]:
         """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status."""
-        episode, conditions = ProcessMetaData, []
+        episode, conditions = orm.ProcessMetaData, []
         if self.status is not None:
-            conditions.append(episode.status == member_of(TaskStatus, self.status, "status"))
+            conditions.append(episode.status == frames.member_of(TaskStatus, self.status, "status"))
         if self.since is not None:
             conditions.append(episode.created_at >= self.since)
         tagged = {
-            each: exists().where(EpisodeTag.process_metadata_id == episode.id, EpisodeTag.tag == each)
+            each: exists().where(orm.EpisodeTag.process_metadata_id == episode.id, orm.EpisodeTag.tag == each)
             for each in (*self.tags, *self.without_tags)
         }
         conditions += [tagged[each] for each in self.tags]
@@ -410,28 +391,30 @@ class EpisodeChoice:
         if self.ids is not None:
             conditions.append(episode.uuid.in_(self.ids))
         if self.robot is not None:
-            robot = EpisodeRobot
+            robot = orm.EpisodeRobot
             named = or_(robot.name == self.robot, robot.model == self.robot)
             conditions.append(exists().where(robot.process_metadata_id == episode.id, named))
         if self.text is not None:
-            by_tag = exists().where(EpisodeTag.process_metadata_id == episode.id, containing(self.text, EpisodeTag.tag))
-            conditions.append(or_(containing(self.text, episode.description, episode.plan), by_tag))
+            by_tag = exists().where(
+                orm.EpisodeTag.process_metadata_id == episode.id, frames.containing(self.text, orm.EpisodeTag.tag)
+            )
+            conditions.append(or_(frames.containing(self.text, episode.description, episode.plan), by_tag))
         return conditions
 
     def counted(self) -> Select[*tuple[int]]:
         """Return the select of the number of episodes that fulfil the conditions, whatever the limit."""
-        return select(func.count(ProcessMetaData.id)).where(*self.conditions())
+        return select(func.count(orm.ProcessMetaData.id)).where(*self.conditions())
 
     def newest(self) -> Select[*tuple[int]]:
         """Return the select of the numbers of the chosen episodes."""
-        return limited(
-            select(ProcessMetaData.id).where(*self.conditions()).order_by(ProcessMetaData.id.desc()), self.limit
+        return frames.limited(
+            select(orm.ProcessMetaData.id).where(*self.conditions()).order_by(orm.ProcessMetaData.id.desc()), self.limit
         )
 
 
 def episode_list(episode: Any, choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
     """Select the chosen episodes with their outcomes, the newest first."""
-    listed = ProcessMetaData
+    listed = orm.ProcessMetaData
     statement = select(
         listed.id.label("episode"),
         listed.uuid.label("id"),
@@ -447,8 +430,8 @@ def episode_list(episode: Any, choice: EpisodeChoice) -> Select[*tuple[Any, ...]
         listed.failure_message,
         listed.continues,
     )
-    conditions = needed(of_episode(listed.id, episode), *choice.conditions())
-    return limited(statement.where(*conditions).order_by(listed.id.desc()), choice.limit)
+    conditions = frames.needed(of_episode(listed.id, episode), *choice.conditions())
+    return frames.limited(statement.where(*conditions).order_by(listed.id.desc()), choice.limit)
 
 
 # === percepts and places ======================================================================================
@@ -562,7 +545,7 @@ def _by_frequency(counts: Mapping[str, int]) -> dict[str, int]:
 
 async def percepts_of(session: AsyncSession, number: int) -> Sequence[Percept]:
     """Read the percepts of an episode, in the order of the events."""
-    seen = Detection.__table__
+    seen = orm.Detection.__table__
     of_episode = select(seen).where(seen.c.process_metadata_id == number)
     rows = await session.execute(of_episode.order_by(seen.c.id, seen.c.position))
     return [
@@ -590,7 +573,7 @@ def _name(value: Any) -> Any:
 
 async def searches_of(session: AsyncSession, number: int) -> Sequence[PlaceSearch]:
     """Read the searches for places of an episode, in the order of the events."""
-    resolution, place, refusal = LocationResolution, Pose, LocationRefusal
+    resolution, place, refusal = orm.LocationResolution, orm.Pose, orm.LocationRefusal
     counted = select(refusal.resolution_id, refusal.reason, func.count()).where(refusal.process_metadata_id == number)
     reasons: dict[int, dict[str, int]] = {}
     for key, reason, count in await session.execute(counted.group_by(refusal.resolution_id, refusal.reason)):

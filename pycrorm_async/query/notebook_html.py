@@ -16,29 +16,12 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import msgspec
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.query import text as texts
 from pycrorm_async.query.episode_diff import EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, counts_text
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.query.sql import SqlResult
-from pycrorm_async.query.text import (
-    FAILED,
-    Drawing,
-    color_of,
-    duration,
-    facts,
-    folding_text,
-    left_out,
-    moment,
-    node_text,
-    one_line,
-    parameters_text,
-    quiet,
-    recorded,
-    sign_of,
-    status,
-    table,
-    view,
-)
+from pycrorm_async.query.text import facts, status
 
 EPISODES_MAX = 100
 """Bounds the rows of a table of episodes."""
@@ -50,44 +33,46 @@ def episodes_html(episodes: Sequence[EpisodeSummary], total: int | None = None, 
 
     `total` is the number of all in the memory, `folding` that of those that the tables do not show as they are yet.
     """
-    lagging = f"<div>{quiet(folding_text(folding))}</div>" if folding else ""
+    lagging = f"<div>{texts.quiet(texts.folding_text(folding))}</div>" if folding else ""
     if not episodes:
-        return view("No episodes", lagging)
+        return texts.view("No episodes", lagging)
     count, shown = len(episodes) if total is None else total, episodes[-EPISODES_MAX:]
-    more = f"<div>{left_out(count - len(shown), 'before these')}</div>" if len(shown) < count else ""
-    return view(f"<b>{count:,} episode{'s' * (count > 1)}</b>", more, table(_COLUMNS, map(_row, shown)), lagging)
+    more = f"<div>{texts.left_out(count - len(shown), 'before these')}</div>" if len(shown) < count else ""
+    return texts.view(
+        f"<b>{count:,} episode{'s' * (count > 1)}</b>", more, texts.table(_COLUMNS, map(_row, shown)), lagging
+    )
 
 
 def _row(each: EpisodeSummary) -> tuple[str, ...]:
     return (
         str(each.number),
-        moment(each.started_at),
-        duration(each.duration_ns),
+        texts.moment(each.started_at),
+        texts.duration(each.duration_ns),
         f"{status(each.status)}{_failed_actions(each)}",
         f"{each.nodes:,}",
         f"{each.failed:,}" if each.failed else "",
-        recorded(each.description, 100),
-        recorded(", ".join(map(str, each.robots)), 60),
-        recorded(", ".join(each.tags), 60),
+        texts.recorded(each.description, 100),
+        texts.recorded(", ".join(map(str, each.robots)), 60),
+        texts.recorded(", ".join(each.tags), 60),
     )
 
 
 def episode_html(each: EpisodeSummary) -> str:
     """Return the facts of an episode."""
     commit = f"{each.git_commit}{' and changes' if each.git_dirty else ''}" if each.git_commit else ""
-    return view(
+    return texts.view(
         _title(each),
         facts(
             {
-                "started": f"{moment(each.started_at)} UTC by {recorded(each.created_by)}",
-                "took": duration(each.duration_ns),
+                "started": f"{texts.moment(each.started_at)} UTC by {texts.recorded(each.created_by)}",
+                "took": texts.duration(each.duration_ns),
                 "nodes": f"{each.nodes:,}, {each.failed:,} failed",
-                "robots": recorded(", ".join(map(str, each.robots))) if each.robots else "",
-                "tags": recorded(", ".join(each.tags)) if each.tags else "",
-                "metadata": recorded(each.metadata) if each.metadata else "",
-                "plan": recorded(each.plan) if each.plan else "",
-                "commit": recorded(commit) if commit else "",
-                "world": recorded(each.world) if each.world else "",
+                "robots": texts.recorded(", ".join(map(str, each.robots))) if each.robots else "",
+                "tags": texts.recorded(", ".join(each.tags)) if each.tags else "",
+                "metadata": texts.recorded(each.metadata) if each.metadata else "",
+                "plan": texts.recorded(each.plan) if each.plan else "",
+                "commit": texts.recorded(commit) if commit else "",
+                "world": texts.recorded(each.world) if each.world else "",
                 "simulated by": f"a node of episode {each.thought_by.episode}" if each.thought_by else "",
                 "id": each.id,
             }
@@ -96,12 +81,12 @@ def episode_html(each: EpisodeSummary) -> str:
 
 
 def _title(each: EpisodeSummary) -> str:
-    more = f"{_failed_actions(each)} {quiet('simulated')}" if each.simulated else _failed_actions(each)
-    return f"<b>Episode {each.number} · {recorded(each.description)}</b> · {status(each.status)}{more}"
+    more = f"{_failed_actions(each)} {texts.quiet('simulated')}" if each.simulated else _failed_actions(each)
+    return f"<b>Episode {each.number} · {texts.recorded(each.description)}</b> · {status(each.status)}{more}"
 
 
 def _failed_actions(each: EpisodeSummary) -> str:
-    return quiet(each.status_text.removeprefix(each.status))
+    return texts.quiet(each.status_text.removeprefix(each.status))
 
 
 def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None) -> str:
@@ -110,12 +95,12 @@ def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None)
     if episode is None:
         title = f"<b>{count}</b>"
     else:
-        took = f" {duration(episode.duration_ns)}" if episode.duration_ns is not None else ""
+        took = f" {texts.duration(episode.duration_ns)}" if episode.duration_ns is not None else ""
         title = f"{_title(episode)}{took} · {count}"
     if not nodes:
-        return view(title)
+        return texts.view(title)
     chart = f'<div style="max-height:340px;overflow:auto;margin:6px 0">{gantt(nodes).svg}</div>'
-    return view(title, chart, tree_html(nodes))
+    return texts.view(title, chart, tree_html(nodes))
 
 
 # === tree view ================================================================================================
@@ -158,21 +143,22 @@ def _keep(kept: set[int], chosen: Sequence[NodeSummary], by_id: Mapping[int, Nod
 
 def root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     """Return the failed nodes without a failed child."""
-    caused = {each.parent_id for each in nodes if each.status in FAILED}
-    return [each for each in nodes if each.status in FAILED and each.id not in caused]
+    caused = {each.parent_id for each in nodes if each.status in texts.FAILED}
+    return [each for each in nodes if each.status in texts.FAILED and each.id not in caused]
 
 
 def tree_html(nodes: Sequence[NodeSummary]) -> str:
     """Return the nodes as indented lines; `nodes` lists each parent before its children, as `TaskTree` does."""
     shown = shown_nodes(nodes)
     lines = "\n".join(f"{'  ' * each.depth}{_line(each)}" for each in shown)
-    more = f"<div>{left_out(len(nodes) - len(shown), 'nodes')}</div>" if len(nodes) > len(shown) else ""
+    more = f"<div>{texts.left_out(len(nodes) - len(shown), 'nodes')}</div>" if len(nodes) > len(shown) else ""
     return f'<div style="font-family:monospace;white-space:pre;overflow-x:auto">{lines}</div>{more}'
 
 
 def _line(node: NodeSummary) -> str:
     counts = counts_text(node), *(f"{number} {noun}s" for number, noun in _made_at(node) if number)
-    return f"{status(node.status, with_name=False)} {recorded(' '.join(filter(None, (node_text(node), *counts))))}"
+    words = " ".join(filter(None, (texts.node_text(node), *counts)))
+    return f"{status(node.status, with_name=False)} {texts.recorded(words)}"
 
 
 def _made_at(node: NodeSummary) -> tuple[tuple[int, str], ...]:
@@ -201,7 +187,7 @@ class _Bar(NamedTuple):
     lane: int
 
 
-def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
+def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> texts.Drawing:
     """Return a chart of the nodes over their events, or over time in s. Raises `CallerError` for another axis.
 
     Robots of a kinematic world jump, so that many nodes take no time; over events each is as wide as its number of
@@ -221,7 +207,7 @@ def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
     for index in range(_TICKS):
         x = _PAD + (_WIDTH - 2 * _PAD) * index / (_TICKS - 1)
         value = first + (last - first) * index / (_TICKS - 1)
-        label = duration(round(value * 1e9)) if axis == "time" else f"e{value:.0f}"
+        label = texts.duration(round(value * 1e9)) if axis == "time" else f"e{value:.0f}"
         if label in labels:  # a chart of few events
             continue
         labels.add(label)
@@ -230,7 +216,7 @@ def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
     if note := _note(drawn, nodes):
         height += _AXIS
         parts.append(f'<text x="{_PAD:.1f}" y="{height - 4:.0f}" opacity=".7">{note}</text>')
-    return Drawing(
+    return texts.Drawing(
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:.0f} {height:.0f}" role="img"'
         f' aria-label="chart of {len(bars)} nodes over {axis}" font-family="system-ui,sans-serif" font-size="11"'
         f' fill="currentColor" style="width:100%;max-width:{_WIDTH:.0f}px">{"".join(parts)}</svg>'
@@ -249,7 +235,7 @@ def _note(drawn: Sequence[NodeSummary], nodes: Sequence[NodeSummary]) -> str:
     """Return the line that counts what a chart of a part of the nodes draws; empty for a chart of all."""
     if len(drawn) == len(nodes):
         return ""
-    failed, all_failed = (sum(each.status in FAILED for each in some) for some in (drawn, nodes))
+    failed, all_failed = (sum(each.status in texts.FAILED for each in some) for some in (drawn, nodes))
     failures = f"all {failed:,}" if failed == all_failed else f"{failed:,} of {all_failed:,}"
     others = f"{len(drawn) - failed:,} of {len(nodes) - all_failed:,}"
     return (
@@ -285,21 +271,23 @@ def _bars(nodes: Sequence[NodeSummary], *, by_time: bool) -> list[_Bar]:
 
 def _drawn(bar: _Bar, left: float, right: float) -> str:
     node, top = bar.node, bar.lane * _LANE + 1
-    width, color = max(right - left - 1, 1.5), color_of(node.status)
+    width, color = max(right - left - 1, 1.5), texts.color_of(node.status)
     dash = ' stroke-dasharray="4 2"' if node.end_sequence is None else ""
     shape = (
         f'<rect x="{left:.1f}" y="{top:.0f}" width="{width:.1f}" height="{_BAR:.0f}" rx="2" fill="{color}"'
         f' fill-opacity=".25" stroke="{color}"{dash}/>'
     )
-    if node.status in FAILED:
+    if node.status in texts.FAILED:
         shape += f'<path d="{_hatch(left, top, width)}" stroke="{color}" stroke-opacity=".7"/>'
     name = node.dtype or node.kind
-    label = name if node.status == "SUCCEEDED" else f"{sign_of(node.status)} {name}"
+    label = name if node.status == "SUCCEEDED" else f"{texts.sign_of(node.status)} {name}"
     room = int((width - 6) / _CHARACTER)
     if room >= 3:
         shown = label if len(label) <= room else f"{label[: room - 1]}…"
         shape += f'<text x="{left + 4:.1f}" y="{top + 12:.0f}">{html.escape(shown)}</text>'
-    hint = one_line(f"{label} {node.status} {duration(node.duration_ns)} {parameters_text(node.parameters)}", 200)
+    hint = texts.one_line(
+        f"{label} {node.status} {texts.duration(node.duration_ns)} {texts.parameters_text(node.parameters)}", 200
+    )
     return f"<g><title>{html.escape(hint)}</title>{shape}</g>"
 
 
@@ -326,57 +314,67 @@ _SQL_MAX = 5_000
 
 def sql_result_html(result: SqlResult) -> str:
     """Return the first rows as a table; a missing value is an empty cell."""
-    rows = ["" if value is None else recorded(value) for row in result.rows[:_ROWS_MAX] for value in row]
+    rows = ["" if value is None else texts.recorded(value) for row in result.rows[:_ROWS_MAX] for value in row]
     width = len(result.columns)
     cells = [rows[start : start + width] for start in range(0, len(rows), width)] if width else []
     count = f"<b>{len(result.rows):,} row{'s' * (len(result.rows) != 1)}</b>"
-    limited = f" {quiet('and more, which a limit left out')}" if result.more else ""
-    return view(count + limited, table([recorded(each) for each in result.columns], cells), _omitted(len(result.rows)))
+    limited = f" {texts.quiet('and more, which a limit left out')}" if result.more else ""
+    return texts.view(
+        count + limited,
+        texts.table([texts.recorded(each) for each in result.columns], cells),
+        _omitted(len(result.rows)),
+    )
 
 
 def question_html(name: str, sql: str, request: str) -> str:
     """Return the name of a question, the code that awaits it, and its SQL."""
     shown = html.escape(sql if len(sql) <= _SQL_MAX else f"{sql[:_SQL_MAX]}…")
     text = f'<div style="font-family:monospace;white-space:pre-wrap;margin:4px 0">{shown}</div>'
-    return view(f"<b>Question {html.escape(name)}</b> {quiet(html.escape(request))}", text)
+    return texts.view(f"<b>Question {html.escape(name)}</b> {texts.quiet(html.escape(request))}", text)
 
 
 def diff_html(compared: EpisodeDiff) -> str:
     """Return the first differences as a table; A and B are the episodes."""
     title = " and ".join(
-        f"<b>{letter}: episode {each.number} · {recorded(each.description)}</b>"
+        f"<b>{letter}: episode {each.number} · {texts.recorded(each.description)}</b>"
         for letter, each in (("A", compared.first), ("B", compared.second))
     )
     rows = [
         [
-            recorded(each.of),
-            recorded(each.where),
-            recorded(f"{each.what}, with {each.below} below" if each.below else each.what),
-            *("" if value is None else recorded(value) for value in (each.first, each.second)),
+            texts.recorded(each.of),
+            texts.recorded(each.where),
+            texts.recorded(f"{each.what}, with {each.below} below" if each.below else each.what),
+            *("" if value is None else texts.recorded(value) for value in (each.first, each.second)),
         ]
         for each in compared.differences[:_ROWS_MAX]
     ]
     count = len(compared.differences)
-    same = quiet(f"{count:,} difference{'s' * (count != 1)}; {compared.same_nodes:,} nodes are the same")
-    return view(title, same, table(("of", "where", "what", "A", "B"), rows) if rows else "", _omitted(count))
+    same = texts.quiet(f"{count:,} difference{'s' * (count != 1)}; {compared.same_nodes:,} nodes are the same")
+    return texts.view(
+        title, same, texts.table(("of", "where", "what", "A", "B"), rows) if rows else "", _omitted(count)
+    )
 
 
 def cases_html(summary: Sequence[str], columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Return the lines of a summary, and the first cases as a table; the column `status` has signs."""
-    title, *lines = (recorded(each) for each in summary)
+    title, *lines = (texts.recorded(each) for each in summary)
     cells = [
         [
-            status(str(value)) if name == "status" else f"{value:.3f}" if isinstance(value, float) else recorded(value)
+            status(str(value))
+            if name == "status"
+            else f"{value:.3f}"
+            if isinstance(value, float)
+            else texts.recorded(value)
             for name, value in zip(columns, ("" if each is None else each for each in row), strict=True)
         ]
         for row in rows[:_ROWS_MAX]
     ]
     facts = [f"<div>{each}</div>" for each in lines]
-    return view(f"<b>{title}</b>", *facts, table(columns, cells) if cells else "", _omitted(len(rows)))
+    return texts.view(f"<b>{title}</b>", *facts, texts.table(columns, cells) if cells else "", _omitted(len(rows)))
 
 
 def _omitted(count: int) -> str:
-    return f"<div>{left_out(count - _ROWS_MAX)}</div>" if count > _ROWS_MAX else ""
+    return f"<div>{texts.left_out(count - _ROWS_MAX)}</div>" if count > _ROWS_MAX else ""
 
 
 # === moment view ==============================================================================================
@@ -386,36 +384,40 @@ def _omitted(count: int) -> str:
 
 def moment_html(then: Moment) -> str:
     """Return the views of a moment below each other."""
-    simulated = f" {quiet('simulated')}" if then.simulated else ""
+    simulated = f" {texts.quiet('simulated')}" if then.simulated else ""
     title = (
-        f"<b>Episode {then.number} · {recorded(then.description)}</b> at {then.time_s:.3f} s, event {then.sequence}"
-        f" {quiet(f'({moment(then.at)} UTC)')} · {status(then.status)}{simulated}"
+        f"<b>Episode {then.number} · {texts.recorded(then.description)}</b>"
+        f" at {then.time_s:.3f} s, event {then.sequence}"
+        f" {texts.quiet(f'({texts.moment(then.at)} UTC)')} · {status(then.status)}{simulated}"
     )
-    running = " → ".join(f"<b>{recorded(each.dtype or each.kind)}</b>" for each in then.running)
+    running = " → ".join(f"<b>{texts.recorded(each.dtype or each.kind)}</b>" for each in then.running)
     seen = list(then.observations.items())
-    rows = [(recorded(name), recorded(_json(each.values)), f"e{each.sequence}") for name, each in seen[:_ROWS_MAX]]
-    observed = [table(("observation", "values", "event"), rows), _omitted(len(seen))] if seen else []
-    doing = f"<div>{running or quiet('nothing was running')}</div>"
-    return view(title, doing, _objects(then.world), *observed, tree_html(then.tree))
+    rows = [
+        (texts.recorded(name), texts.recorded(_json(each.values)), f"e{each.sequence}")
+        for name, each in seen[:_ROWS_MAX]
+    ]
+    observed = [texts.table(("observation", "values", "event"), rows), _omitted(len(seen))] if seen else []
+    doing = f"<div>{running or texts.quiet('nothing was running')}</div>"
+    return texts.view(title, doing, _objects(then.world), *observed, tree_html(then.tree))
 
 
 def world_html(world: WorldThen) -> str:
     """Return the table of the objects of a world."""
-    return view(f"<b>{len(world.objects):,} object{'s' * (len(world.objects) != 1)}</b>", _objects(world))
+    return texts.view(f"<b>{len(world.objects):,} object{'s' * (len(world.objects) != 1)}</b>", _objects(world))
 
 
 def _objects(world: WorldThen) -> str:
     if not world.objects:
-        return f"<div>{quiet('the world was empty at this moment')}</div>"
+        return f"<div>{texts.quiet('the world was empty at this moment')}</div>"
     columns = ("object", "type", "x, m", "y, m", "z, m", "heading", "attached to")
-    return table(columns, map(_object_row, world.objects[:_ROWS_MAX])) + _omitted(len(world.objects))
+    return texts.table(columns, map(_object_row, world.objects[:_ROWS_MAX])) + _omitted(len(world.objects))
 
 
 def _object_row(each: ObjectThen) -> Sequence[str]:
-    attached = recorded(", ".join(filter(None, each.attached_to))) if each.attached_to is not None else ""
+    attached = texts.recorded(", ".join(filter(None, each.attached_to))) if each.attached_to is not None else ""
     position = (f"{value:.3f}" for value in each.pose.position)
     heading = f"{round(math.degrees(each.pose.yaw)) + 0}°"
-    return recorded(each.name, 40), recorded(each.object_type), *position, heading, attached
+    return texts.recorded(each.name, 40), texts.recorded(each.object_type), *position, heading, attached
 
 
 def _json(values: object) -> str:

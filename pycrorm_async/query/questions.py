@@ -34,67 +34,23 @@ from typing import (
     overload,
 )
 
-from sqlalchemy import (
-    CTE,
-    BigInteger,
-    ColumnElement,
-    Float,
-    Select,
-    Text,
-    and_,
-    case,
-    cast,
-    func,
-    literal,
-    literal_column,
-    null,
-    or_,
-    select,
-    tuple_,
-    union_all,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import aliased
 
+from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
-from pycrorm_async.orm import (
-    Attachment,
-    Designator,
-    Detection,
-    JointChange,
-    Object,
-    ObjectRemoval,
-    PickUpAction,
-    Pose,
-    RootFailure,
-    TaskTreeNode,
-)
+from pycrorm_async.orm import Object
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.projections.derived_views import OUTCOMES, RECOVERED, sql_of
-from pycrorm_async.query.frames import (
-    FAILED,
-    TRIED,
-    check_texts,
-    checked_count,
-    checked_metres,
-    containing,
-    equal,
-    is_named,
-    json_text,
-    limited,
-    member_of,
-    needed,
-    of_episode,
-    success_rate,
-    times_with,
-)
+from pycrorm_async.query import frames
 from pycrorm_async.query.named_queries import EpisodeChoice, episode_list
 from pycrorm_async.query.question import CHECKED, AskedEpisode, QuestionPlan, classes_meant_by
 from pycrorm_async.query.text import nearest
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
-Rows: TypeAlias = "Select[*tuple[Any, ...]]"
+Rows: TypeAlias = "sa.Select[*tuple[Any, ...]]"
 
 # === arguments ================================================================================================
 #
@@ -200,7 +156,9 @@ class _Question(Generic[P]):
         """Check the values of arguments and return the plan of the question about them. Raises `CallerError`."""
         arguments = {name: each.name if isinstance(each, Enum) else each for name, each in values.items()}
         episode = arguments.pop("episode", None)
-        check_texts({name: each for name, each in arguments.items() if self.arguments[name].type not in _NO_TEXTS})
+        frames.check_texts(
+            {name: each for name, each in arguments.items() if self.arguments[name].type not in _NO_TEXTS}
+        )
         for name, each in arguments.items():
             if self.arguments[name].type is bool and not isinstance(each, bool | None):
                 raise CallerError(f"{name} must be True or False, got {each!r}")
@@ -215,22 +173,26 @@ _NO_TEXTS = (bool, int, float, datetime)
 
 # === actions ==================================================================================================
 
-_NODE, _DESIGNATOR = TaskTreeNode.__table__, Designator.__table__
+_NODE, _DESIGNATOR = orm.TaskTreeNode.__table__, orm.Designator.__table__
 
 
 def _by_type(episode: Any, columns: Iterable[Any], *, dtype: str | None, kind: str) -> Rows:
     """Count the nodes of each type, with their successes and failures and further columns."""
-    node = TaskTreeNode
+    node = orm.TaskTreeNode
     if kind not in ("action", "motion", "language"):
         raise CallerError(f"kind must be action, motion or language, got {kind!r}")
-    conditions = node.kind == kind, of_episode(node.process_metadata_id, episode), equal(node.dtype, dtype)
-    return select(node.dtype, *_counts(node.status), *columns).where(*conditions).group_by(node.dtype)
+    conditions = (
+        node.kind == kind,
+        frames.of_episode(node.process_metadata_id, episode),
+        frames.equal(node.dtype, dtype),
+    )
+    return sa.select(node.dtype, *_counts(node.status), *columns).where(*conditions).group_by(node.dtype)
 
 
-def _counts(status: Any) -> tuple[ColumnElement[int], ...]:
+def _counts(status: Any) -> tuple[sa.ColumnElement[int], ...]:
     """Return the numbers of rows, of successes and of failures in a group."""
-    succeeded, failed = times_with(status == TaskStatus.SUCCEEDED), times_with(status.in_(FAILED))
-    return func.count().label("times"), succeeded.label("succeeded"), failed.label("failed")
+    succeeded, failed = frames.times_with(status == TaskStatus.SUCCEEDED), frames.times_with(status.in_(frames.FAILED))
+    return sa.func.count().label("times"), succeeded.label("succeeded"), failed.label("failed")
 
 
 # === failures =================================================================================================
@@ -250,36 +212,36 @@ def _matching(
     message: Any,
     text: Any,
     recovered: Any,
-) -> list[ColumnElement[bool]]:
+) -> list[sa.ColumnElement[bool]]:
     """Return the conditions on `RootFailure`.
 
     A failure is searched by its columns, not by one bag of words: the milk's failure must not answer to `cereal`
     because the episode's description names both.
     """
-    failure = RootFailure
-    conditions = [of_episode(failure.process_metadata_id, episode)]
+    failure = orm.RootFailure
+    conditions = [frames.of_episode(failure.process_metadata_id, episode)]
     if object is not None:
-        conditions.append(containing(object, failure.object))
+        conditions.append(frames.containing(object, failure.object))
     if arm is not None:
-        conditions.append(is_named(failure.arm, arm))
+        conditions.append(frames.is_named(failure.arm, arm))
     if reason is not None:
         conditions.append(_is_reason(reason))
     if message is not None:
-        conditions.append(containing(message, failure.message))
+        conditions.append(frames.containing(message, failure.message))
     if text is not None:
         columns = failure.object, failure.arm, failure.message, failure.dtype
         # Words that mean a class together, as in "out of reach", count together.
         words = [text] if classes_meant_by(text) else text.split()
         if len(words) > _WORDS_MAX:
             raise CallerError(f"text has {len(words)} words, and at most {_WORDS_MAX} are searched for")
-        conditions += [or_(containing(each, *columns), _is_reason(each)) for each in words]
-    return needed(*conditions, equal(failure.recovered, recovered))
+        conditions += [sa.or_(frames.containing(each, *columns), _is_reason(each)) for each in words]
+    return frames.needed(*conditions, frames.equal(failure.recovered, recovered))
 
 
-def _is_reason(words: str) -> ColumnElement[bool]:
+def _is_reason(words: str) -> sa.ColumnElement[bool]:
     classes = classes_meant_by(words)
-    named = containing(words, RootFailure.reason)
-    return or_(named, RootFailure.reason.in_(classes)) if classes else named
+    named = frames.containing(words, orm.RootFailure.reason)
+    return sa.or_(named, orm.RootFailure.reason.in_(classes)) if classes else named
 
 
 def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
@@ -289,25 +251,25 @@ def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
     for PostgreSQL, which without statistics estimates one row with it, and otherwise reads and sorts all nodes of the
     episode for each failure.
     """
-    earlier = aliased(TaskTreeNode)
+    earlier = aliased(orm.TaskTreeNode)
     return (
-        select(earlier.id)
+        sa.select(earlier.id)
         .where(earlier.process_metadata_id == episode, earlier.id > _first_id(episode), earlier.id < node_id)
         .where(earlier.kind.in_(("action", "motion")), earlier.end_sequence < sequence)
         .order_by(earlier.id.desc())
-        .limit(literal_column("1"))
+        .limit(sa.literal_column("1"))
         .scalar_subquery()
     )
 
 
 def _first_id(episode: Any) -> Any:
     """Return the number below all ids of the episode, which is above all those of the one before."""
-    return cast(episode, BigInteger).bitwise_lshift(literal_column(str(_NUMBER_BITS)))
+    return sa.cast(episode, sa.BigInteger).bitwise_lshift(sa.literal_column(str(_NUMBER_BITS)))
 
 
 # === object courses ===========================================================================================
 
-_OBJECT, _POSE = Object.__table__, Pose.__table__
+_OBJECT, _POSE = Object.__table__, orm.Pose.__table__
 
 
 def _course(
@@ -323,38 +285,38 @@ def _course(
     time: Any = None,
 ) -> Rows:
     """Select one kind of event of an object's history: its columns, in the order of the answer."""
-    return select(
+    return sa.select(
         table.c.process_metadata_id.label("episode"),
         sequence.label("sequence"),
         (table.c.time if time is None else time).label("time"),
-        (literal(happening, Text) if isinstance(happening, str) else happening).label("what"),
-        cast(null() if other is None else other, Text).label("other"),
-        cast(null() if detail is None else detail, Text).label("detail"),
-        cast(null() if value is None else value, Float).label("value"),
-        *(cast(null() if place is None else place.c[axis], Float).label(axis) for axis in "xyz"),
+        (sa.literal(happening, sa.Text) if isinstance(happening, str) else happening).label("what"),
+        sa.cast(sa.null() if other is None else other, sa.Text).label("other"),
+        sa.cast(sa.null() if detail is None else detail, sa.Text).label("detail"),
+        sa.cast(sa.null() if value is None else value, sa.Float).label("value"),
+        *(sa.cast(sa.null() if place is None else place.c[axis], sa.Float).label(axis) for axis in "xyz"),
         (table.c.node_id if node_id is None else node_id).label("node_id"),
     )
 
 
-def _joined(episode: Any, id_: Any, row: Any, other: Any) -> ColumnElement[bool]:
+def _joined(episode: Any, id_: Any, row: Any, other: Any) -> sa.ColumnElement[bool]:
     """Return the condition that `row` has this id, which a row of `other` names.
 
     With `episode` it names the episode itself, so that one part of a divided table is read wherever the row is joined.
     """
     same = row.c.id == id_, row.c.process_metadata_id == other.c.process_metadata_id
-    return and_(*same, of_episode(row.c.process_metadata_id, episode))
+    return sa.and_(*same, frames.of_episode(row.c.process_metadata_id, episode))
 
 
-def _failures(episode: Any) -> CTE:
+def _failures(episode: Any) -> sa.CTE:
     """Return the failures as a subquery that is evaluated before they are filtered by object.
 
     Without statistics PostgreSQL expects one failure of an object, and would read all nodes of the episode to find out
     whether a node below it failed.
     """
-    failed = RootFailure.__table__
+    failed = orm.RootFailure.__table__
     columns = failed.c.id, failed.c.process_metadata_id, failed.c.start_time, failed.c.reason, failed.c.object
-    statement = select(*columns, RootFailure.sequence.label("sequence"))
-    statement = statement.where(*needed(of_episode(failed.c.process_metadata_id, episode)))
+    statement = sa.select(*columns, orm.RootFailure.sequence.label("sequence"))
+    statement = statement.where(*frames.needed(frames.of_episode(failed.c.process_metadata_id, episode)))
     return statement.cte("failed").prefix_with("MATERIALIZED", dialect="postgresql")
 
 
@@ -419,8 +381,8 @@ class Ask(Generic[Q]):
             recovered: whether the same was tried again and succeeded, or an alternative did.
             limit: of rows.
         """
-        failure = RootFailure
-        statement = select(
+        failure = orm.RootFailure
+        statement = sa.select(
             failure.process_metadata_id.label("episode"),
             failure.sequence.label("sequence"),
             failure.dtype,
@@ -438,7 +400,7 @@ class Ask(Generic[Q]):
             episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
         )
         # Not `order_by(failure.id)`, for which SQLite reads all nodes in order instead of the failed ones by an index.
-        return limited(statement.where(*search).order_by(failure.id + 0), limit)
+        return frames.limited(statement.where(*search).order_by(failure.id + 0), limit)
 
     @_Question
     @staticmethod
@@ -462,26 +424,26 @@ class Ask(Generic[Q]):
             episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
         )
         names = "reason dtype object process_metadata_id start_time message outcome".split()
-        chosen = select(*(getattr(RootFailure, each) for each in names)).where(*search)
+        chosen = sa.select(*(getattr(orm.RootFailure, each) for each in names)).where(*search)
         # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them.
         # For one with a number PostgreSQL would rather have the first row early than read fewer nodes, and read all of
         # them.
-        failed = chosen.limit(sql_of(BigInteger(), "-1", "ALL")).subquery("failed").c
+        failed = chosen.limit(sql_of(sa.BigInteger(), "-1", "ALL")).subquery("failed").c
         causes = failed.reason, failed.dtype, failed.object
         statement = (
-            select(
+            sa.select(
                 *causes,
-                func.count().label("times"),
-                times_with(failed.outcome == RECOVERED).label(RECOVERED),
-                func.count(failed.process_metadata_id.distinct()).label("episodes"),
-                func.max(failed.start_time).label("last_time"),
-                func.min(failed.message).label("a_message"),
-                *(times_with(failed.outcome == each).label(each) for each in OUTCOMES if each != RECOVERED),
+                sa.func.count().label("times"),
+                frames.times_with(failed.outcome == RECOVERED).label(RECOVERED),
+                sa.func.count(failed.process_metadata_id.distinct()).label("episodes"),
+                sa.func.max(failed.start_time).label("last_time"),
+                sa.func.min(failed.message).label("a_message"),
+                *(frames.times_with(failed.outcome == each).label(each) for each in OUTCOMES if each != RECOVERED),
             )
             .group_by(*causes)
-            .order_by(func.count().desc(), *causes)
+            .order_by(sa.func.count().desc(), *causes)
         )
-        return limited(statement, limit)
+        return frames.limited(statement, limit)
 
     @_Question
     @staticmethod
@@ -501,17 +463,17 @@ class Ask(Generic[Q]):
 
         `steps` is their number for each failure, 1 to 100; the other arguments are those of `root_failures`.
         """
-        failure, step, count = RootFailure, TaskTreeNode, checked_count("steps", steps, 100)
+        failure, step, count = orm.RootFailure, orm.TaskTreeNode, frames.checked_count("steps", steps, 100)
         search = _matching(
             episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
         )
         latest = (
-            select(
+            sa.select(
                 failure.process_metadata_id.label("episode"),
                 failure.sequence.label("failure_sequence"),
                 failure.dtype.label("failed"),
                 failure.reason,
-                cast(literal_column("1"), BigInteger).label("steps_before"),
+                sa.cast(sa.literal_column("1"), sa.BigInteger).label("steps_before"),
                 _ended_before(failure.id, failure.process_metadata_id, failure.sequence).label("node_id"),
                 failure.id.label("failure_id"),
             )
@@ -521,7 +483,7 @@ class Ask(Generic[Q]):
         # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
         same = "episode", "failure_sequence", "failed", "reason"
         latest = latest.union_all(
-            select(
+            sa.select(
                 *(latest.c[each] for each in same),
                 latest.c.steps_before + 1,
                 _ended_before(latest.c.node_id, latest.c.episode, latest.c.failure_sequence),
@@ -530,7 +492,7 @@ class Ask(Generic[Q]):
         )
         is_step = step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode
         statement = (
-            select(
+            sa.select(
                 *(latest.c[each] for each in same),
                 latest.c.steps_before,
                 step.sequence.label("sequence"),
@@ -540,16 +502,16 @@ class Ask(Generic[Q]):
                 step.duration.label("duration_s"),
                 step.id.label("node_id"),
             )
-            .join(step, and_(*is_step, of_episode(step.process_metadata_id, episode)))
+            .join(step, sa.and_(*is_step, frames.of_episode(step.process_metadata_id, episode)))
             # Both hold of every step. PostgreSQL expects ten times as many steps as there are, and would read all nodes
             # to join them; with each range it expects a two-hundredth of that, and looks the steps up by their ids.
             .where(
-                latest.c.steps_before.between(literal_column("1"), literal_column(str(count))),
+                latest.c.steps_before.between(sa.literal_column("1"), sa.literal_column(str(count))),
                 latest.c.node_id.between(_first_id(latest.c.episode), _first_id(latest.c.episode + 1)),
             )
             .order_by(latest.c.failure_id, latest.c.steps_before)
         )
-        return limited(statement, limit)
+        return frames.limited(statement, limit)
 
     # --- actions ----------------------------------------------------------------------------------------------
 
@@ -560,19 +522,19 @@ class Ask(Generic[Q]):
 
         A share counts what succeeded, failed or ended in an error; not what was cancelled, interrupted or lost.
         """
-        node = TaskTreeNode
-        episodes = func.count(node.process_metadata_id.distinct()).label("episodes")
-        columns = *success_rate(node.status, node.status.in_(TRIED)), episodes
+        node = orm.TaskTreeNode
+        episodes = sa.func.count(node.process_metadata_id.distinct()).label("episodes")
+        columns = *frames.success_rate(node.status, node.status.in_(frames.TRIED)), episodes
         statement = _by_type(episode, columns, dtype=dtype, kind=kind)
-        return limited(statement.order_by(func.count().desc(), node.dtype), limit)
+        return frames.limited(statement.order_by(sa.func.count().desc(), node.dtype), limit)
 
     @_Question
     @staticmethod
     def longest_actions(*, episode: Of = None, dtype: Dtype = None, status: Status = None, limit: Limit = 10) -> Rows:
         """List the ended actions that took longest, also only those of one type (`dtype`) or status."""
-        node = TaskTreeNode
-        state = None if status is None else member_of(TaskStatus, status, "status")
-        statement = select(
+        node = orm.TaskTreeNode
+        state = None if status is None else frames.member_of(TaskStatus, status, "status")
+        statement = sa.select(
             node.process_metadata_id.label("episode"),
             node.sequence.label("sequence"),
             node.dtype,
@@ -584,39 +546,48 @@ class Ask(Generic[Q]):
         ).where(
             node.kind == "action",
             node.end_ns.is_not(None),
-            of_episode(node.process_metadata_id, episode),
-            equal(node.dtype, dtype),
-            equal(node.status, state),
+            frames.of_episode(node.process_metadata_id, episode),
+            frames.equal(node.dtype, dtype),
+            frames.equal(node.status, state),
         )
-        return limited(statement.order_by((node.end_ns - node.start_ns).desc(), node.id), limit)
+        return frames.limited(statement.order_by((node.end_ns - node.start_ns).desc(), node.id), limit)
 
     @_Question
     @staticmethod
     def durations(*, episode: Of = None, dtype: Dtype = None, kind: Kind = "action", limit: Limit = None) -> Rows:
         """Sum up the durations of each type: number, successes, failures, total, mean, shortest, longest."""
-        node = TaskTreeNode
-        sums: dict[str, Any] = {"total_s": func.sum, "mean_s": func.avg, "shortest_s": func.min, "longest_s": func.max}
+        node = orm.TaskTreeNode
+        sums: dict[str, Any] = {
+            "total_s": sa.func.sum,
+            "mean_s": sa.func.avg,
+            "shortest_s": sa.func.min,
+            "longest_s": sa.func.max,
+        }
         columns = [each(node.duration).label(name) for name, each in sums.items()]
         statement = _by_type(episode, columns, dtype=dtype, kind=kind)
-        return limited(statement.order_by(func.sum(node.duration).desc(), node.dtype), limit)
+        return frames.limited(statement.order_by(sa.func.sum(node.duration).desc(), node.dtype), limit)
 
     @_Question
     @staticmethod
     def arms_used(*, episode: Of = None, dtype: Dtype = None, limit: Limit = None) -> Rows:
         """Count the actions of each arm and type, with their successes and failures."""
-        node, parameters = TaskTreeNode, _DESIGNATOR.c.parameters
-        arm = func.coalesce(json_text(parameters, "arm"), json_text(parameters, "gripper")).label("arm")
+        node, parameters = orm.TaskTreeNode, _DESIGNATOR.c.parameters
+        arm = sa.func.coalesce(frames.json_text(parameters, "arm"), frames.json_text(parameters, "gripper")).label(
+            "arm"
+        )
         statement = (
-            select(arm, node.dtype, *_counts(node.status))
+            sa.select(arm, node.dtype, *_counts(node.status))
             .join(_DESIGNATOR, same_row(_DESIGNATOR, _NODE))
             .where(
                 node.kind == "action",
                 arm.is_not(None),
-                of_episode(node.process_metadata_id, episode),
-                equal(node.dtype, dtype),
+                frames.of_episode(node.process_metadata_id, episode),
+                frames.equal(node.dtype, dtype),
             )
         )
-        return limited(statement.group_by(arm, node.dtype).order_by(arm, func.count().desc(), node.dtype), limit)
+        return frames.limited(
+            statement.group_by(arm, node.dtype).order_by(arm, sa.func.count().desc(), node.dtype), limit
+        )
 
     @_Question
     @staticmethod
@@ -631,10 +602,10 @@ class Ask(Generic[Q]):
         limit: Limit = None,
     ) -> Rows:
         """List the pick-ups that succeeded: object, arm, grasp, and the robot's base pose."""
-        node, taken, pick_up, pose = TaskTreeNode, Object.__table__, PickUpAction.__table__, Pose.__table__
+        node, taken, pick_up, pose = orm.TaskTreeNode, Object.__table__, orm.PickUpAction.__table__, orm.Pose.__table__
         is_taken = taken.c.id == pick_up.c.object_designator_id
         statement = (
-            select(
+            sa.select(
                 node.process_metadata_id.label("episode"),
                 node.sequence.label("sequence"),
                 taken.c.name.label("object"),
@@ -654,7 +625,7 @@ class Ask(Generic[Q]):
             .outerjoin(
                 pose, (pose.c.id == node.robot_pose_id) & (pose.c.process_metadata_id == node.process_metadata_id)
             )
-            .where(node.status == TaskStatus.SUCCEEDED, of_episode(node.process_metadata_id, episode))
+            .where(node.status == TaskStatus.SUCCEEDED, frames.of_episode(node.process_metadata_id, episode))
             .order_by(node.id)
         )
         if episode is not None and not isinstance(episode, Sequence):
@@ -662,7 +633,7 @@ class Ask(Generic[Q]):
             numbers: Any = episode
             statement = statement.where(pick_up.c.id.between(_first_id(numbers), _first_id(numbers + 1)))
         if object is not None:
-            statement = statement.where(containing(object, taken.c.name))
+            statement = statement.where(frames.containing(object, taken.c.name))
         members = (
             (taken.c.obj_type, ObjectType, object_type, "object_type"),
             (pick_up.c.arm, Arms, arm, "arm"),
@@ -670,8 +641,8 @@ class Ask(Generic[Q]):
         )
         for column, enum, value, argument in members:
             if value is not None:
-                statement = statement.where(column == member_of(enum, value, argument))
-        return limited(statement.where(equal(node.robot, robot)), limit)
+                statement = statement.where(column == frames.member_of(enum, value, argument))
+        return frames.limited(statement.where(frames.equal(node.robot, robot)), limit)
 
     @_Question
     @staticmethod
@@ -688,20 +659,20 @@ class Ask(Generic[Q]):
 
         A share counts what `success_rates` counts.
         """
-        x, y, radius_m = (checked_metres(*each) for each in (("x", x), ("y", y), ("radius_m", radius_m)))
+        x, y, radius_m = (frames.checked_metres(*each) for each in (("x", x), ("y", y), ("radius_m", radius_m)))
         if radius_m <= 0:
             raise CallerError(f"radius_m must be > 0, got {radius_m}")
-        node, pose = TaskTreeNode, Pose
-        arm = json_text(_DESIGNATOR.c.parameters, "arm").label("arm")
+        node, pose = orm.TaskTreeNode, orm.Pose
+        arm = frames.json_text(_DESIGNATOR.c.parameters, "arm").label("arm")
         east, north = pose.x - x, pose.y - y
         statement = (
-            select(
+            sa.select(
                 node.dtype,
                 arm,
                 *_counts(node.status),
-                *success_rate(node.status, node.status.in_(TRIED)),
-                func.avg(node.duration).label("mean_s"),
-                func.max(node.start_time).label("last_time"),
+                *frames.success_rate(node.status, node.status.in_(frames.TRIED)),
+                sa.func.avg(node.duration).label("mean_s"),
+                sa.func.max(node.start_time).label("last_time"),
             )
             .join(_DESIGNATOR, same_row(_DESIGNATOR, _NODE))
             .join(pose, (pose.id == node.robot_pose_id) & (pose.process_metadata_id == node.process_metadata_id))
@@ -710,13 +681,13 @@ class Ask(Generic[Q]):
                 node.end_sequence.is_not(None),
                 pose.x.between(x - radius_m, x + radius_m),
                 east * east + north * north <= radius_m * radius_m,
-                of_episode(node.process_metadata_id, episode),
-                equal(node.dtype, dtype),
+                frames.of_episode(node.process_metadata_id, episode),
+                frames.equal(node.dtype, dtype),
             )
             .group_by(node.dtype, arm)
-            .order_by(func.count().desc(), node.dtype, arm)
+            .order_by(sa.func.count().desc(), node.dtype, arm)
         )
-        return limited(statement, limit)
+        return frames.limited(statement, limit)
 
     # --- objects ----------------------------------------------------------------------------------------------
 
@@ -724,41 +695,43 @@ class Ask(Generic[Q]):
     @staticmethod
     def object_history(name: Name, *, episode: Of = None, limit: Limit = None) -> Rows:
         """List all that happened to the object of this name: added, moved, attached, seen, failed with, removed."""
-        attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
-        seen, other = Detection.__table__, _OBJECT.alias("other")
+        attached, removed, joints = orm.Attachment.__table__, orm.ObjectRemoval.__table__, orm.JointChange.__table__
+        seen, other = orm.Detection.__table__, _OBJECT.alias("other")
         is_added = _OBJECT.c.id == _OBJECT.c.identity_id
-        begins = Attachment.kind == "attached"
-        named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(
-            is_named(_OBJECT.c.name, name), of_episode(_OBJECT.c.process_metadata_id, episode)
+        begins = orm.Attachment.kind == "attached"
+        named = sa.select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(
+            frames.is_named(_OBJECT.c.name, name), frames.of_episode(_OBJECT.c.process_metadata_id, episode)
         )
         joined = partial(_joined, episode)
 
-        def is_one(table: Any, id_: Any) -> ColumnElement[bool]:
-            return tuple_(id_, table.c.process_metadata_id).in_(named)
+        def is_one(table: Any, id_: Any) -> sa.ColumnElement[bool]:
+            return sa.tuple_(id_, table.c.process_metadata_id).in_(named)
 
         failed = _failures(episode)
         # IN chooses the rows, and what is joined to them is joined outside: of inner joins that share the episode
         # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
         courses = [
-            _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
+            _course(_OBJECT, Object.sequence, sa.case((is_added, "added"), else_="moved"), place=_POSE)
             .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
-            .where(is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
+            .where(
+                frames.is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"
+            ),
             *(
-                _course(attached, Attachment.sequence, happening, other=other.c.name, detail=attached.c.link)
+                _course(attached, orm.Attachment.sequence, happening, other=other.c.name, detail=attached.c.link)
                 .outerjoin(other, joined(partner, other, attached))
                 .where(is_one(attached, own))
                 for happening, own, partner in (
                     (attached.c.kind, attached.c.child_id, attached.c.parent_id),
-                    (case((begins, "holds"), else_="releases"), attached.c.parent_id, attached.c.child_id),
+                    (sa.case((begins, "holds"), else_="releases"), attached.c.parent_id, attached.c.child_id),
                 )
             ),
-            _course(removed, ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
-            _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position).where(
-                is_one(joints, joints.c.object_id)
-            ),
+            _course(removed, orm.ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
             _course(
-                seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen
-            ).where(is_named(seen.c.name, name)),
+                joints, orm.JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position
+            ).where(is_one(joints, joints.c.object_id)),
+            _course(
+                seen, orm.Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen
+            ).where(frames.is_named(seen.c.name, name)),
             _course(
                 failed,
                 failed.c.sequence,
@@ -766,17 +739,17 @@ class Ask(Generic[Q]):
                 detail=failed.c.reason,
                 node_id=failed.c.id,
                 time=failed.c.start_time,
-            ).where(is_named(failed.c.object, name)),
+            ).where(frames.is_named(failed.c.object, name)),
         ]
-        courses = [each.where(of_episode(each.selected_columns.episode, episode)) for each in courses]
-        course = union_all(*courses).subquery("course")
+        courses = [each.where(frames.of_episode(each.selected_columns.episode, episode)) for each in courses]
+        course = sa.union_all(*courses).subquery("course")
         of_course = _NODE.c.id == course.c.node_id, _NODE.c.process_metadata_id == course.c.episode
         statement = (
-            select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
-            .outerjoin(_NODE, and_(*of_course, of_episode(_NODE.c.process_metadata_id, episode)))
+            sa.select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
+            .outerjoin(_NODE, sa.and_(*of_course, frames.of_episode(_NODE.c.process_metadata_id, episode)))
             .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
         )
-        return limited(statement, limit)
+        return frames.limited(statement, limit)
 
     @_Question
     @staticmethod
@@ -785,30 +758,30 @@ class Ask(Generic[Q]):
         by, joined = _NODE.alias("by"), partial(_joined, episode)
         moved = "id", "process_metadata_id", "time", "name", "pose_id", "node_id"
         moves = (
-            select(*(_OBJECT.c[each] for each in moved), Object.sequence.label("sequence"))
+            sa.select(*(_OBJECT.c[each] for each in moved), Object.sequence.label("sequence"))
             .where(
-                is_named(_OBJECT.c.name, name),
+                frames.is_named(_OBJECT.c.name, name),
                 _OBJECT.c.id != _OBJECT.c.identity_id,
                 _OBJECT.c.dtype == "Object",
-                of_episode(_OBJECT.c.process_metadata_id, episode),
+                frames.of_episode(_OBJECT.c.process_metadata_id, episode),
             )
             .cte("moves")
         )
         columns = ("id", "parent_id", "process_metadata_id", "kind", "dtype", "status")
         up = (
-            select(moves.c.id.label("move"), *(by.c[each] for each in columns))
+            sa.select(moves.c.id.label("move"), *(by.c[each] for each in columns))
             .join(by, joined(moves.c.node_id, by, moves))
             .cte("up", recursive=True)
         )
         above = _NODE.alias("above")
         up = up.union_all(
-            select(up.c.move, *(above.c[each] for each in columns)).where(
+            sa.select(up.c.move, *(above.c[each] for each in columns)).where(
                 up.c.kind != "action", joined(up.c.parent_id, above, up)
             )
         )
         mover = _NODE.alias("mover")
         statement = (
-            select(
+            sa.select(
                 moves.c.process_metadata_id.label("episode"),
                 moves.c.sequence,
                 moves.c.time,
@@ -819,12 +792,12 @@ class Ask(Generic[Q]):
                 up.c.status.label("action_status"),
                 up.c.id.label("action_id"),
             )
-            .outerjoin(up, and_(up.c.move == moves.c.id, up.c.kind == "action"))
+            .outerjoin(up, sa.and_(up.c.move == moves.c.id, up.c.kind == "action"))
             .outerjoin(mover, joined(moves.c.node_id, mover, moves))
             .outerjoin(_POSE, joined(moves.c.pose_id, _POSE, moves))
             .order_by(moves.c.id)
         )
-        return limited(statement, limit)
+        return frames.limited(statement, limit)
 
     # --- episodes ---------------------------------------------------------------------------------------------
 

@@ -15,29 +15,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from pycrorm_async.errors import DatabaseForeign, LogDamaged, PycrormError
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import (
-    EVENT_TYPES,
-    LOSES_OPEN_NODES,
-    EpisodeEnded,
-    EpisodeStarted,
-    EpisodeTagged,
-    FailureValue,
-    Happening,
-    JointsMoved,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectDetected,
-    ObjectMoved,
-    ObjectRemoved,
-    Observed,
-    PoseValue,
-)
+from pycrorm_async.events.types import EpisodeStarted
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.text import with_object_names
@@ -68,7 +49,7 @@ class ReplayedNode:
     start: EventTime
     end: EventTime | None = None
     status: str = "RUNNING"
-    failure: FailureValue | None = None
+    failure: event_types.FailureValue | None = None
     considered: int = 0
     offered: int = 0
     detected: int = 0
@@ -88,8 +69,8 @@ class ReplayedNode:
 class WorldObject:
     """An object in the world. `row` is the sequence of the event that set its pose."""
 
-    added: ObjectAdded
-    pose: PoseValue
+    added: event_types.ObjectAdded
+    pose: event_types.PoseValue
     row: int
     joints: dict[str, float] = field(default_factory=dict)
     attached_to: tuple[int, str | None] | None = None
@@ -108,27 +89,27 @@ class ReplayedWorld:
 
     def __init__(self, *, strict: bool = True) -> None:
         self.objects: dict[int, WorldObject] = {}
-        self.added: dict[int, ObjectAdded] = {}
+        self.added: dict[int, event_types.ObjectAdded] = {}
         self._strict = strict
 
-    def read(self, sequence: int, happening: Happening) -> None:
+    def read(self, sequence: int, happening: event_types.Happening) -> None:
         """Apply an event of the world. Events of a removed object have no effect."""
         match happening:
-            case ObjectAdded():
+            case event_types.ObjectAdded():
                 self.added[sequence] = happening
                 self.objects[sequence] = WorldObject(happening, happening.pose, sequence, dict(happening.joints))
-            case ObjectMoved():
+            case event_types.ObjectMoved():
                 if (moved := self._present(happening.object)) is not None:
                     moved.pose, moved.row = happening.pose, sequence
-            case JointsMoved():
+            case event_types.JointsMoved():
                 if (moved := self._present(happening.object.object)) is not None:
                     moved.joints.update(happening.joints)
-            case ObjectAttached() | ObjectDetached():
+            case event_types.ObjectAttached() | event_types.ObjectDetached():
                 self._present(happening.parent.object)
                 if (child := self._present(happening.child.object)) is not None:
-                    attached = isinstance(happening, ObjectAttached)
+                    attached = isinstance(happening, event_types.ObjectAttached)
                     child.attached_to = (happening.parent.object, happening.link) if attached else None
-            case ObjectRemoved():
+            case event_types.ObjectRemoved():
                 self._present(happening.object.object)
                 self.objects.pop(happening.object.object, None)
 
@@ -175,13 +156,13 @@ class EpisodeReplay:
         self.begin_ns = self.begin_wall_ns = self.wall_ns = 0
         self.at = EventTime(0, 0)
         self.started = EpisodeStarted("", "", "", "", "")
-        self.ended: EpisodeEnded | None = None
+        self.ended: event_types.EpisodeEnded | None = None
         self.tags: tuple[str, ...] = ()
         self.nodes: dict[int, ReplayedNode] = {}
         self.world = ReplayedWorld(strict=strict)
-        self.observed: dict[str, tuple[StoredEvent, Observed]] = {}
-        self.detections: deque[tuple[StoredEvent, ObjectDetected]] = deque(maxlen=LATEST_MAX)
-        self.searches: deque[tuple[StoredEvent, LocationResolved]] = deque(maxlen=LATEST_MAX)
+        self.observed: dict[str, tuple[StoredEvent, event_types.Observed]] = {}
+        self.detections: deque[tuple[StoredEvent, event_types.ObjectDetected]] = deque(maxlen=LATEST_MAX)
+        self.searches: deque[tuple[StoredEvent, event_types.LocationResolved]] = deque(maxlen=LATEST_MAX)
         self._address = address
         self._strict = strict
         self._samples = samples
@@ -199,7 +180,7 @@ class EpisodeReplay:
         """Return the parameters of a node, with the names of the objects that they refer to."""
         return with_object_names(node.parameters, lambda each: self.world.name_of(each["object"]))
 
-    def read(self, event: StoredEvent) -> Happening | None:
+    def read(self, event: StoredEvent) -> event_types.Happening | None:
         """Apply the next event and return it; None for a sample that is not decoded.
 
         Raises `LogDamaged`, or `DatabaseForeign` for an event of a newer version.
@@ -216,34 +197,34 @@ class EpisodeReplay:
         self.at, self.wall_ns = at, event.wall_ns
         return happening
 
-    def _decoded(self, event: StoredEvent) -> Happening | None:
+    def _decoded(self, event: StoredEvent) -> event_types.Happening | None:
         if self.at.sequence == 0 and event.type != "EpisodeStarted":
             raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
         return happening_of(event) if self._samples or event.type != "StateSampled" else None
 
-    def _apply(self, event: StoredEvent, at: EventTime, happening: Happening) -> None:
+    def _apply(self, event: StoredEvent, at: EventTime, happening: event_types.Happening) -> None:
         match happening:
-            case NodeStarted():
+            case event_types.NodeStarted():
                 self._start(event, at, happening)
-            case NodeEnded():
+            case event_types.NodeEnded():
                 self._end(at, happening)
             case EpisodeStarted():
                 if self.at.sequence > 0:
                     raise CannotFold("the episode starts a second time")
                 self.started = happening
                 self.tags = retagged((), happening.tags, ())
-            case EpisodeTagged():
+            case event_types.EpisodeTagged():
                 self.tags = retagged(self.tags, happening.added, happening.removed)
-            case EpisodeEnded():
+            case event_types.EpisodeEnded():
                 self._end_episode(happening)
-            case Observed():
+            case event_types.Observed():
                 self.observed[happening.name] = event, happening
-            case ObjectDetected() | LocationResolved():
+            case event_types.ObjectDetected() | event_types.LocationResolved():
                 self._answer(event, happening)
             case _:
                 self.world.read(event.sequence, happening)
 
-    def _start(self, event: StoredEvent, at: EventTime, started: NodeStarted) -> None:
+    def _start(self, event: StoredEvent, at: EventTime, started: event_types.NodeStarted) -> None:
         parent = started.parent
         if self._strict and parent is not None and parent not in self.nodes:
             raise CannotFold(f"its parent {parent} never started")
@@ -251,17 +232,17 @@ class EpisodeReplay:
             started.kind, parent, started.designator, started.parameters, started.simulated, event.wall_ns, at
         )
 
-    def _end(self, at: EventTime, ended: NodeEnded) -> None:
+    def _end(self, at: EventTime, ended: event_types.NodeEnded) -> None:
         if (node := self.nodes.get(ended.node)) is None:
             raise CannotFold(f"node {ended.node} ends and never started")
         node.status, node.failure = ended.status, ended.failure
         if ended.status != "LOST":
             node.end = at
 
-    def _answer(self, event: StoredEvent, answer: ObjectDetected | LocationResolved) -> None:
+    def _answer(self, event: StoredEvent, answer: event_types.ObjectDetected | event_types.LocationResolved) -> None:
         """Keep the answer of perception or of a location designator, and count it at the node that asked."""
         node = self.nodes.get(answer.node or 0)
-        if isinstance(answer, LocationResolved):
+        if isinstance(answer, event_types.LocationResolved):
             self.searches.append((event, answer))
             if node is not None:
                 node.considered += answer.considered
@@ -271,9 +252,9 @@ class EpisodeReplay:
             if node is not None:
                 node.detected += len(answer.seen)
 
-    def _end_episode(self, ended: EpisodeEnded) -> None:
+    def _end_episode(self, ended: event_types.EpisodeEnded) -> None:
         self.ended = ended
-        if ended.status in LOSES_OPEN_NODES:
+        if ended.status in event_types.LOSES_OPEN_NODES:
             for node in self.nodes.values():
                 if node.status == "RUNNING":
                     node.status = "LOST"
@@ -281,7 +262,7 @@ class EpisodeReplay:
 
 def _unreadable(episode: str, event: StoredEvent, reason: str, address: DatabaseAddress) -> PycrormError:
     """Return the error for an event that cannot be applied: of a newer version, or damaged."""
-    shape = EVENT_TYPES.get(event.type)
+    shape = event_types.EVENT_TYPES.get(event.type)
     if shape is not None and event.version <= shape.version:
         return LogDamaged(episode, event.sequence, reason)
     return DatabaseForeign(

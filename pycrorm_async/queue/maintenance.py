@@ -14,25 +14,8 @@ from typing import Final, TypeAlias
 
 from pycrorm_async.errors import InternalError, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue import format as spool_format
 from pycrorm_async.queue.blobs import blob_bytes, blob_files
-from pycrorm_async.queue.format import (
-    COMMIT,
-    EPISODE_ENDED,
-    EVENT,
-    Frame,
-    LastRecord,
-    ReadCursor,
-    SegmentHeader,
-    decode_header,
-    encode_segment_header,
-    encode_span,
-    header_bytes,
-    read_segment,
-    salt_of,
-    segment_numbers,
-    segment_path,
-    sync_folder,
-)
 from pycrorm_async.queue.locks import (
     ALIVE,
     BLOBS,
@@ -257,7 +240,7 @@ def _look(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport:
 
 def _bytes(folder: Path) -> int:
     try:
-        segments = [segment_path(folder, number) for number in segment_numbers(folder)]
+        segments = [spool_format.segment_path(folder, number) for number in spool_format.segment_numbers(folder)]
     except FileNotFoundError:  # all records were stored and the folder deleted meanwhile
         return 0
     return sum(_size(each) for each in segments)
@@ -279,13 +262,13 @@ class _Count:
     segments: Counter[int] = field(default_factory=Counter)
     safe: int = 0
 
-    def count_frame(self, after: ReadCursor, frame: Frame) -> None:
-        if frame.kind == COMMIT:
+    def count_frame(self, after: spool_format.ReadCursor, frame: spool_format.Frame) -> None:
+        if frame.kind == spool_format.COMMIT:
             self.safe = frame.position
             return
         self.segments[after.number] += 1
         self.types[frame.type.decode(errors="replace")] += 1
-        if frame.kind == EVENT:
+        if frame.kind == spool_format.EVENT:
             self.episodes.add(frame.episode)
 
 
@@ -293,8 +276,8 @@ def _examine(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport
     folder = recorder.path
     counted, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or report.being_drained)
     entries = [each.name for each in folder.iterdir()]
-    numbers = {*prefix.numbers, *segment_numbers(folder)}  # also those begun or deleted since the scan
-    ours = {ALIVE, BLOBS, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in numbers)}
+    numbers = {*prefix.numbers, *spool_format.segment_numbers(folder)}  # also those begun or deleted since the scan
+    ours = {ALIVE, BLOBS, DRAIN, PROGRESS, *(spool_format.segment_path(folder, number).name for number in numbers)}
     others = sorted(_text(each) for each in entries if each not in ours)
     return replace(
         report,
@@ -304,7 +287,7 @@ def _examine(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport
         segments=tuple(
             SegmentReport(path.name, _size(path), prefix.bases.get(number), counted.segments[number])
             for number in prefix.numbers
-            for path in [segment_path(folder, number)]
+            for path in [spool_format.segment_path(folder, number)]
         ),
         types=dict(sorted(counted.types.items())),
         episodes=len(counted.episodes | set(prefix.open)),
@@ -365,14 +348,18 @@ class _Salvage:
         self._numbers = [each for each in prefix.numbers if each >= self._first]
         self.headless = not prefix.bases and self._first > 1
         self.unreadable: list[Range] = []
-        self.dropped: dict[EpisodeId, list[Frame]] = {}
-        earlier = {each: segment_path(folder, each) for each in prefix.bases if each < self._first}
+        self.dropped: dict[EpisodeId, list[spool_format.Frame]] = {}
+        earlier = {each: spool_format.segment_path(folder, each) for each in prefix.bases if each < self._first}
         before = SegmentScanner(folder, self._recorder, segments=earlier)
         while before.step():
             pass
         self._open, self.position = dict(before.prefix.open), before.prefix.cut.position
         self._uncommitted = before.uncommitted  # by the segments that stay: the first new commit frame covers them
-        header = decode_header(read_segment(segment_path(folder, self._first))) if self._first in prefix.bases else None
+        header = (
+            spool_format.decode_header(spool_format.read_segment(spool_format.segment_path(folder, self._first)))
+            if self._first in prefix.bases
+            else None
+        )
         if header is not None:
             self._open, self.position = dict(header.open), header.base - 1
         if self.headless:
@@ -385,19 +372,21 @@ class _Salvage:
         for damaged in self._numbers:
             before, after = dict(self._open), self.position
             frames = list(self._frames(damaged))
-            safe = max([safe, *(frame.position for frame in frames if frame.kind == COMMIT)])
-            kept = [frame for frame in frames if frame.kind != COMMIT and self._keep(frame)]
+            safe = max([safe, *(frame.position for frame in frames if frame.kind == spool_format.COMMIT)])
+            kept = [frame for frame in frames if frame.kind != spool_format.COMMIT and self._keep(frame)]
             if kept or damaged == self._first:
-                header = encode_segment_header(SegmentHeader(self._recorder, number, after + 1, before))
-                salt = salt_of(self._recorder, number)
-                span = encode_span(kept, after=after, salt=salt, uncommitted=self._uncommitted)
-                write_durably(segment_path(self._folder, number), b"".join((header, *span)))
+                header = spool_format.encode_segment_header(
+                    spool_format.SegmentHeader(self._recorder, number, after + 1, before)
+                )
+                salt = spool_format.salt_of(self._recorder, number)
+                span = spool_format.encode_span(kept, after=after, salt=salt, uncommitted=self._uncommitted)
+                write_durably(spool_format.segment_path(self._folder, number), b"".join((header, *span)))
                 self._uncommitted = ()
                 number += 1
             self.position += len(kept)
         for damaged in self._numbers:
             if damaged >= number:
-                segment_path(self._folder, damaged).unlink()
+                spool_format.segment_path(self._folder, damaged).unlink()
         if safe > self._last_position:
             self.unreadable.append((self._last_position + 1, safe))
 
@@ -406,11 +395,13 @@ class _Salvage:
         last = self._open.get(episode)
         return last.sequence if last is not None else 0
 
-    def _frames(self, number: int) -> Iterator[Frame]:
+    def _frames(self, number: int) -> Iterator[spool_format.Frame]:
         """Decode the whole frames of a segment that a recorder can have written."""
-        path = segment_path(self._folder, number)
-        for offset, frame in whole_frames(read_segment(path), header_bytes(0), salt_of(self._recorder, number)):
-            if frame.kind != COMMIT:
+        path = spool_format.segment_path(self._folder, number)
+        for offset, frame in whole_frames(
+            spool_format.read_segment(path), spool_format.header_bytes(0), spool_format.salt_of(self._recorder, number)
+        ):
+            if frame.kind != spool_format.COMMIT:
                 try:
                     check_record(path, offset, frame)
                 except SpoolDamaged:  # the gap it leaves is reported
@@ -420,29 +411,31 @@ class _Salvage:
     def _reconstruct_header(self) -> None:
         """Find the episodes that were open before the first record: their first sequences here are above 1."""
         met: set[bytes] = set()
-        for frame in (each for number in self._numbers for each in self._frames(number) if each.kind != COMMIT):
+        for frame in (
+            each for number in self._numbers for each in self._frames(number) if each.kind != spool_format.COMMIT
+        ):
             self.position = self.position or frame.position - 1
-            if frame.kind == EVENT and frame.episode not in met:
+            if frame.kind == spool_format.EVENT and frame.episode not in met:
                 met.add(frame.episode)
                 if frame.sequence > 1:
-                    before = LastRecord(frame.sequence - 1, frame.wall_ns, frame.monotonic_ns)
+                    before = spool_format.LastRecord(frame.sequence - 1, frame.wall_ns, frame.monotonic_ns)
                     self._open[EpisodeId(frame.episode)] = before
 
-    def _keep(self, frame: Frame) -> bool:
+    def _keep(self, frame: spool_format.Frame) -> bool:
         """Return whether this record can be kept; note a dropped record, and the positions missing before it."""
         if frame.position <= self._last_position:
             return False
         if frame.position > self._last_position + 1:
             self.unreadable.append((self._last_position + 1, frame.position - 1))
         self._last_position = frame.position
-        if frame.kind != EVENT:
+        if frame.kind != spool_format.EVENT:
             return True
         episode = EpisodeId(frame.episode)
         if frame.sequence != self.kept_to(episode) + 1:
             self.dropped.setdefault(episode, []).append(frame)
             return False
-        self._open[episode] = LastRecord(frame.sequence, frame.wall_ns, frame.monotonic_ns)
-        if frame.type == EPISODE_ENDED.encode():
+        self._open[episode] = spool_format.LastRecord(frame.sequence, frame.wall_ns, frame.monotonic_ns)
+        if frame.type == spool_format.EPISODE_ENDED.encode():
             del self._open[episode]
         return True
 
@@ -557,8 +550,8 @@ def _copy_aside(folder: Path) -> Path:
     copies = (folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}{each}") for each in names)
     aside = next(each for each in copies if not each.exists())
     shutil.copytree(folder, aside, copy_function=_link, ignore=shutil.ignore_patterns(ALIVE, DRAIN, PROGRESS))
-    sync_folder(aside)
-    sync_folder(folder.parent)
+    spool_format.sync_folder(aside)
+    spool_format.sync_folder(folder.parent)
     return aside
 
 
@@ -577,6 +570,6 @@ def finish_repairs(spool: Path) -> list[Path]:
             folder = repaired.with_name(repaired.name.removesuffix(MENDED))
             if not folder.exists():  # the damaged folder was renamed only after the new one was whole and synced
                 repaired.rename(folder)
-                sync_folder(spool)
+                spool_format.sync_folder(spool)
                 folders.append(folder)
     return folders

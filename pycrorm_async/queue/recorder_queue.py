@@ -33,15 +33,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from pycrorm_async import errors
 from pycrorm_async.clock import Clock
-from pycrorm_async.errors import (
-    FilesError,
-    InternalError,
-    PycrormError,
-    SpoolClosed,
-    SpoolDamaged,
-    SpoolUnavailable,
-)
 from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.appender import Appender, Capacity
@@ -94,7 +87,7 @@ class RecorderQueue:
         self._room_notifier = Notifier()
         self._synced = 0
         self._stored = 0
-        self._failure: PycrormError | None = None
+        self._failure: errors.PycrormError | None = None
         self._has_refused = False  # a record, because of the failure
         self._is_displaced = False
         self._closed = False
@@ -238,7 +231,7 @@ class RecorderQueue:
     # --- positions ---------------------------------------------------------------------------------------------
 
     @property
-    def failure(self) -> PycrormError | None:
+    def failure(self) -> errors.PycrormError | None:
         """The error that makes the queue refuse records; None while it accepts them, and after `close`."""
         return self._failure
 
@@ -325,7 +318,7 @@ class RecorderQueue:
         if path is not None:
             self._is_displaced = True
             reason = "was deleted or replaced while the queue wrote to it: nothing is recorded until the next start"
-            self._fail(SpoolUnavailable(path, reason))
+            self._fail(errors.SpoolUnavailable(path, reason))
         return path is None
 
     # --- the consumer ------------------------------------------------------------------------------------------
@@ -344,7 +337,7 @@ class RecorderQueue:
         """Mark the records up to this position as stored in the database; the sync thread frees their segments."""
         assert position <= self._source.reader.cursor.position, "only supplied records can be acknowledged"
         if self._log_id is None:
-            with contextlib.suppress(FilesError):
+            with contextlib.suppress(errors.FilesError):
                 self._log_id = Spool(self.folder.parent).log_id()
         self._stored = max(self._stored, position)
         if self._trimmable():
@@ -374,7 +367,7 @@ class RecorderQueue:
         """Refuse further events and request the last sync; `get_batch` supplies the rest, then an empty list."""
         if self._closed:
             return
-        self._appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
+        self._appender.refuse(lambda: errors.SpoolClosed(f"queue {self.name} is closed"))
         self._closed = True
         self._sync_thread.hurry()
         self._notifier.notify_all()
@@ -391,7 +384,7 @@ class RecorderQueue:
             return
         self.close()
         if not self._sync_thread.stop(timeout_s=_LAST_SYNC_S):
-            raise SpoolUnavailable(self.folder, f"the last sync took more than {_LAST_SYNC_S:.0f} s")
+            raise errors.SpoolUnavailable(self.folder, f"the last sync took more than {_LAST_SYNC_S:.0f} s")
         self._released = True
         self._appender.close()
         try:
@@ -418,7 +411,7 @@ class RecorderQueue:
     def _abandon(self) -> None:
         """Detach in a forked child: the queue belongs to the parent. The locks close their own copies there."""
         self._closed = self._released = True
-        self._failure = SpoolClosed(f"queue {self.name} belongs to the process that forked this one")
+        self._failure = errors.SpoolClosed(f"queue {self.name} belongs to the process that forked this one")
         failure = self._failure
         self._appender.abandon(lambda: failure)
         self._blobs.abandon()
@@ -440,10 +433,10 @@ class RecorderQueue:
             full = self._prepare()
         except OSError as error:
             if self.check_files():
-                self._fail(SpoolUnavailable(self.folder, error.strerror or str(error)))
+                self._fail(errors.SpoolUnavailable(self.folder, error.strerror or str(error)))
             return None
         except BaseException as error:
-            self._fail(InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
+            self._fail(errors.InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
             raise
         if full:
             return min(self._sync_interval_s, PROGRESS_INTERVAL_S)  # plans may wait for the space
@@ -517,14 +510,14 @@ class RecorderQueue:
         self._room_notifier.notify_all()  # plans that wait since a put met a full disk
         return False
 
-    def _fail(self, error: PycrormError) -> None:
+    def _fail(self, error: errors.PycrormError) -> None:
         _log.error("recording has stopped: %s", error)
         self._failure = error
         self._appender.refuse(partial(self._refused_after, error))
         self._notifier.notify_all()
         self._room_notifier.notify_all()
 
-    def _refused_after(self, error: PycrormError) -> PycrormError:
+    def _refused_after(self, error: errors.PycrormError) -> errors.PycrormError:
         self._has_refused = True
         return error
 
@@ -555,7 +548,7 @@ class OwnSource:
         """Implement `RecorderQueue.get_batch`."""
         try:
             return await self._batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
-        except (SpoolDamaged, SpoolUnavailable) as error:
+        except (errors.SpoolDamaged, errors.SpoolUnavailable) as error:
             self._queue.check_files()  # a deleted file explains the error
             raise self._queue.failure or error from None
 
@@ -598,4 +591,4 @@ class OwnSource:
             with wrap_os_errors(self._queue.folder):
                 self._drain = FileLock.take(self._queue.folder / DRAIN)
             if self._drain is None:
-                raise SpoolUnavailable(self._queue.folder, "is being drained by another process")
+                raise errors.SpoolUnavailable(self._queue.folder, "is being drained by another process")

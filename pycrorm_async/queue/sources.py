@@ -15,26 +15,9 @@ import msgspec
 from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.queue import format as spool_format
+from pycrorm_async.queue import spool
 from pycrorm_async.queue.blobs import blob_files
-from pycrorm_async.queue.format import (
-    EPISODE_ENDED,
-    EVENT,
-    Frame,
-    LastRecord,
-    ReadBatch,
-    ReadCursor,
-    Reader,
-    ReadPlace,
-    SegmentHeader,
-    encode_segment_header,
-    encode_span,
-    header_bytes,
-    map_segment,
-    salt_of,
-    segment_numbers,
-    segment_path,
-    sync_folder,
-)
 from pycrorm_async.queue.locks import ALIVE, DRAIN, REFUSED, FileLock, create_folder, is_locked
 from pycrorm_async.queue.scan import (
     SegmentScanner,
@@ -45,16 +28,6 @@ from pycrorm_async.queue.scan import (
     survey,
     sync_segments,
     truncate_at_lost_blob,
-)
-from pycrorm_async.queue.spool import (
-    DrainNote,
-    DrainStatus,
-    Progress,
-    parse_folder_name,
-    remove_folder,
-    remove_made_ahead,
-    wrap_os_errors,
-    write_durably,
 )
 from pycrorm_async.queue.stored_segments import StoredSegments
 
@@ -94,7 +67,7 @@ class DeadLetters:
             if episode not in self._episodes:
                 self._episodes[episode] = _EpisodeFolder(self._folder, episode)
             self._episodes[episode].put(run)
-            if run[-1].type == EPISODE_ENDED:
+            if run[-1].type == spool_format.EPISODE_ENDED:
                 self._episodes.pop(episode).release()
 
     def release(self) -> None:
@@ -107,12 +80,12 @@ class _EpisodeFolder:
     """One episode's folder, locked. Seals the files of earlier processes and continues in a new file."""
 
     def __init__(self, recorder_folder: Path, episode: EpisodeId) -> None:
-        self._recorder = parse_folder_name(recorder_folder.name).recorder
+        self._recorder = spool.parse_folder_name(recorder_folder.name).recorder
         self._episode = episode
         self.folder = recorder_folder.with_name(f"{recorder_folder.name}.{episode_text(episode)}{REFUSED}")
-        self._last: LastRecord | None = None
+        self._last: spool_format.LastRecord | None = None
         self._uncommitted: tuple[int, ...] = ()
-        with wrap_os_errors(self.folder):
+        with spool.wrap_os_errors(self.folder):
             with suppress(FileExistsError):
                 create_folder(self.folder)
             alive = FileLock.take(self.folder / ALIVE)
@@ -134,7 +107,7 @@ class _EpisodeFolder:
             raise SpoolUnavailable(
                 self.folder, f"holds events up to {head}, and event {fresh[0].sequence} leaves a gap"
             )
-        with wrap_os_errors(self.folder):
+        with spool.wrap_os_errors(self.folder):
             if self._bytes < _SEGMENT_BYTES:
                 self._append(fresh)
             else:
@@ -148,8 +121,8 @@ class _EpisodeFolder:
     def _resume(self) -> None:
         """Find the last record; truncate a torn tail and sync the rest."""
 
-        def note_last(_: ReadCursor, frame: Frame) -> None:
-            if frame.kind == EVENT:
+        def note_last(_: spool_format.ReadCursor, frame: spool_format.Frame) -> None:
+            if frame.kind == spool_format.EVENT:
                 self._last = _last_of(frame)
 
         prefix, damage, self._uncommitted = survey(self.folder, self._recorder, on_frame=note_last)
@@ -157,22 +130,22 @@ class _EpisodeFolder:
             raise damage
         seal(self.folder, prefix)
         sync_segments(self.folder, prefix.bases)
-        sync_folder(self.folder.parent)
+        spool_format.sync_folder(self.folder.parent)
         self._number, self._position = prefix.cut.number, prefix.cut.position
         self._bytes = _SEGMENT_BYTES  # a sealed file is not extended: begin another
 
     def _begin(self, fresh: Sequence[Record]) -> None:
         first = fresh[0]
-        before = self._last or LastRecord(first.sequence - 1, first.wall_ns, first.monotonic_ns)
+        before = self._last or spool_format.LastRecord(first.sequence - 1, first.wall_ns, first.monotonic_ns)
         opened = {self._episode: before} if first.sequence > 1 else {}
         self._number += 1
-        header = SegmentHeader(self._recorder, self._number, self._position + 1, opened)
-        content = b"".join((encode_segment_header(header), *self._span(fresh)))
-        write_durably(segment_path(self.folder, self._number), content)
+        header = spool_format.SegmentHeader(self._recorder, self._number, self._position + 1, opened)
+        content = b"".join((spool_format.encode_segment_header(header), *self._span(fresh)))
+        spool.write_durably(spool_format.segment_path(self.folder, self._number), content)
         self._bytes = len(content)
 
     def _append(self, fresh: Sequence[Record]) -> None:
-        with segment_path(self.folder, self._number).open("ab") as file:
+        with spool_format.segment_path(self.folder, self._number).open("ab") as file:
             for part in self._span(fresh):  # records, sync, commit frame, sync: in this order (queue/__init__.py)
                 self._bytes += file.write(part)
                 file.flush()
@@ -180,15 +153,17 @@ class _EpisodeFolder:
 
     def _span(self, fresh: Sequence[Record]) -> tuple[bytes, bytes]:
         frames = [
-            Frame(EVENT, version, 0, sequence, wall_ns, monotonic_ns, self._episode, kind.encode(), payload)
+            spool_format.Frame(
+                spool_format.EVENT, version, 0, sequence, wall_ns, monotonic_ns, self._episode, kind.encode(), payload
+            )
             for _, _, sequence, kind, version, wall_ns, monotonic_ns, payload in fresh
         ]
-        salt = salt_of(self._recorder, self._number)
-        return encode_span(frames, after=self._position, salt=salt, uncommitted=self._uncommitted)
+        salt = spool_format.salt_of(self._recorder, self._number)
+        return spool_format.encode_span(frames, after=self._position, salt=salt, uncommitted=self._uncommitted)
 
 
-def _last_of(record: Record | Frame) -> LastRecord:
-    return LastRecord(record.sequence, record.wall_ns, record.monotonic_ns)
+def _last_of(record: Record | spool_format.Frame) -> spool_format.LastRecord:
+    return spool_format.LastRecord(record.sequence, record.wall_ns, record.monotonic_ns)
 
 
 # === dead source ==============================================================================================
@@ -223,7 +198,7 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool
     folder. Moves segments whose records are all stored to `stored`, or deletes them without it. Raises `SpoolDamaged`,
     `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
     """
-    with wrap_os_errors(folder), ExitStack() as locks:
+    with spool.wrap_os_errors(folder), ExitStack() as locks:
         own = folder.with_name(folder.name.partition(".")[0])
         if own != folder and (own / ALIVE).exists():
             return None
@@ -232,7 +207,7 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool
             if lock is None:
                 return None
             locks.callback(lock.release)
-        recorder = parse_folder_name(folder.name).recorder
+        recorder = spool.parse_folder_name(folder.name).recorder
         truncate_at_lost_blob(folder, recorder)
         if check:
             scan(folder, recorder)
@@ -275,7 +250,7 @@ class DeadSource:
     @property
     def holds_dead_letters(self) -> bool:
         """True if this is a folder of dead letters."""
-        return parse_folder_name(self.name).episode is not None
+        return spool.parse_folder_name(self.name).episode is not None
 
     @property
     def damage(self) -> SpoolDamaged | None:
@@ -308,12 +283,12 @@ class DeadSource:
         assert position <= self._supplied, "only supplied records can be acknowledged"
         self.stored = max(self.stored, position)
         bases = self._scanner.prefix.bases
-        with wrap_os_errors(self.folder):
+        with spool.wrap_os_errors(self.folder):
             for number in sorted(bases):
                 following = bases.get(number + 1)
                 if following is None or following - 1 > position:
                     break
-                self._delete_segment(segment_path(self.folder, number))
+                self._delete_segment(spool_format.segment_path(self.folder, number))
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
         """Implement `RecorderQueue.dead_letter`; return False for records that are dead letters already; these stay."""
@@ -347,10 +322,10 @@ class DeadSource:
             if not self.all_stored:
                 return None
             if not self._released:
-                with wrap_os_errors(self.folder):
-                    remove_made_ahead(self.folder)
+                with spool.wrap_os_errors(self.folder):
+                    spool.remove_made_ahead(self.folder)
                     self._keep_last_segments()
-                    remove_folder(self.folder)
+                    spool.remove_folder(self.folder)
         finally:
             self._released = True
             self._dead_letters.release()
@@ -374,11 +349,11 @@ class DeadSource:
         for number in numbers:
             length = cut.offset if number == cut.number else None
             blobs = blob_files(self.folder) if number == numbers[-1] else []
-            self._delete_segment(segment_path(self.folder, number), length=length, blobs=blobs)
+            self._delete_segment(spool_format.segment_path(self.folder, number), length=length, blobs=blobs)
 
     def _scan_further(self) -> bool:
         """Scan and sync the next segment; False if there is none."""
-        with wrap_os_errors(self.folder):
+        with spool.wrap_os_errors(self.folder):
             if self._scanner.finished:
                 return False
             more = self._scanner.step()
@@ -414,7 +389,7 @@ def computed_ends(prefix: ValidPrefix) -> tuple[Record, ...]:
             position=prefix.cut.position + 1 + index,
             episode=episode,
             sequence=last.sequence + 1,
-            type=EPISODE_ENDED,
+            type=spool_format.EPISODE_ENDED,
             version=1,
             wall_ns=last.wall_ns,
             monotonic_ns=last.monotonic_ns,
@@ -450,7 +425,7 @@ class LiveSource:
 
     holds_dead_letters = False
 
-    def __init__(self, folder: Path, recorder: EpisodeId, drain: FileLock, progress: Progress) -> None:
+    def __init__(self, folder: Path, recorder: EpisodeId, drain: FileLock, progress: spool.Progress) -> None:
         """Called by `take` only, which holds the lock. Raises what `take` raises."""
         self.folder = folder
         self.name = folder.name
@@ -459,9 +434,9 @@ class LiveSource:
         self._progress = progress
         self._dead_letters = DeadLetters(folder)
         before = progress.drained()
-        self._status = before._replace(note=DrainNote())  # drops the note of an earlier drainer
+        self._status = before._replace(note=spool.DrainNote())  # drops the note of an earlier drainer
         visible = min(before.stored, before.folded, progress.recorded().synced)
-        self._reader = Reader(ReadPlace(folder, recorder, self._start_of(visible)))
+        self._reader = spool_format.Reader(spool_format.ReadPlace(folder, recorder, self._start_of(visible)))
         self._reader.skip_to(visible)
         self._until: int | None = None
         self._alive_checked_s = 0.0
@@ -474,8 +449,8 @@ class LiveSource:
 
         Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
         """
-        with wrap_os_errors(folder), ExitStack() as opened:
-            progress = Progress.open(folder, writing=True)
+        with spool.wrap_os_errors(folder), ExitStack() as opened:
+            progress = spool.Progress.open(folder, writing=True)
             if progress is None:
                 return None
             opened.callback(progress.close)
@@ -507,7 +482,7 @@ class LiveSource:
             last = synced if self._until is None else min(synced, self._until)
             if last > self.supplied:
                 try:
-                    with wrap_os_errors(self.folder):
+                    with spool.wrap_os_errors(self.folder):
                         batch = self._read(last=last, events_max=events_max, bytes_max=bytes_max)
                 except (SpoolDamaged, SpoolUnavailable):
                     if self.is_alive:
@@ -571,7 +546,7 @@ class LiveSource:
     @property
     def is_alive(self) -> bool:
         """True if the recorder lives and has not deleted its folder. Raises `SpoolUnavailable`."""
-        with wrap_os_errors(self.folder):
+        with spool.wrap_os_errors(self.folder):
             return is_locked(self.folder / ALIVE)
 
     def release(self) -> str | None:
@@ -606,7 +581,7 @@ class LiveSource:
         self._alive_checked_s = now_s
         return not self.is_alive
 
-    def _read(self, *, last: int, events_max: int, bytes_max: int) -> ReadBatch:
+    def _read(self, *, last: int, events_max: int, bytes_max: int) -> spool_format.ReadBatch:
         try:
             return self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
         except FileNotFoundError:  # the recorder has just deleted segments that an earlier drainer stored
@@ -618,23 +593,23 @@ class LiveSource:
         if status != self._status:
             self._write_status(status)
 
-    def _write_status(self, status: DrainStatus) -> None:
-        with wrap_os_errors(self.folder):
+    def _write_status(self, status: spool.DrainStatus) -> None:
+        with spool.wrap_os_errors(self.folder):
             self._progress.write_drain_status(status)
         self._status = status
 
-    def _start_of(self, visible: int) -> ReadCursor:
+    def _start_of(self, visible: int) -> spool_format.ReadCursor:
         """Return the beginning of the segment with the record behind this position, or of the oldest segment."""
-        start: ReadCursor | None = None
-        for number in segment_numbers(self.folder):
-            path = segment_path(self.folder, number)
+        start: spool_format.ReadCursor | None = None
+        for number in spool_format.segment_numbers(self.folder):
+            path = spool_format.segment_path(self.folder, number)
             try:
-                buffer = map_segment(path)
+                buffer = spool_format.map_segment(path)
             except FileNotFoundError:  # stored and deleted since the listing
                 continue
             with buffer:
                 header = read_header(path, buffer, recorder=self._recorder, number=number)
             if header is None or (start is not None and header.base - 1 > visible):
                 break
-            start = ReadCursor(number, header_bytes(len(header.open)), header.base - 1)
-        return start or ReadCursor(1, header_bytes(0), 0)
+            start = spool_format.ReadCursor(number, spool_format.header_bytes(len(header.open)), header.base - 1)
+        return start or spool_format.ReadCursor(1, spool_format.header_bytes(0), 0)

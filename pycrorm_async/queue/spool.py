@@ -38,27 +38,8 @@ import msgspec
 
 from pycrorm_async.errors import PycrormError, SpoolForeign, SpoolTaken, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.queue import locks
 from pycrorm_async.queue.format import segment_numbers, segment_path, sync_folder
-from pycrorm_async.queue.locks import (
-    ALIVE,
-    BLOBS,
-    DRAIN,
-    MAKING,
-    NUMBERS,
-    PROGRESS,
-    REFUSED,
-    STORED,
-    TAIL,
-    FileLock,
-    call_in_forked_child,
-    check_file_system,
-    create_folder,
-    create_spool,
-    folder_lock,
-    is_locked,
-    open_file,
-    read_note,
-)
 from pycrorm_async.settings import FileAccess
 
 BINDING: Final = "log"
@@ -109,28 +90,28 @@ class Spool:
             return [
                 path
                 for path in self._entries()
-                if path.name not in {BINDING, STORED, WRITER} and not _is_recorder(path)
+                if path.name not in {BINDING, locks.STORED, WRITER} and not _is_recorder(path)
             ]
 
-    def take_writer(self) -> FileLock | None:
+    def take_writer(self) -> locks.FileLock | None:
         """Take the lock of the daemon that drains this spool; None if a daemon holds it. Creates a missing spool.
 
         Raises `SpoolUnavailable`.
         """
         with wrap_os_errors(self.path):
-            create_spool(self.path, self.access)
-            return FileLock.take(self.path / WRITER)
+            locks.create_spool(self.path, self.access)
+            return locks.FileLock.take(self.path / WRITER)
 
     @property
     def has_writer(self) -> bool:
         """Return whether a daemon drains this spool now. Raises `SpoolUnavailable`."""
         with wrap_os_errors(self.path):
-            return is_locked(self.path / WRITER)
+            return locks.is_locked(self.path / WRITER)
 
     def writer_note(self) -> bytes | None:
         """Read the note of the daemon that drains this spool now; None without one. Raises `SpoolUnavailable`."""
         with wrap_os_errors(self.path):
-            return read_note(self.path / WRITER) if is_locked(self.path / WRITER) else None
+            return locks.read_note(self.path / WRITER) if locks.is_locked(self.path / WRITER) else None
 
     def bind(self, log_id: str) -> None:
         """Bind this spool to a log, the only one it may be drained into. Creates a missing spool.
@@ -143,8 +124,8 @@ class Spool:
         if not log_id or log_id != log_id.strip() or "\n" in log_id:
             raise ValueError(f"not an id: {log_id!r}")
         with wrap_os_errors(self.path):
-            create_spool(self.path, self.access)
-            with folder_lock(self.path):
+            locks.create_spool(self.path, self.access)
+            with locks.folder_lock(self.path):
                 bound = self.log_id()
                 if bound == log_id:
                     return
@@ -166,18 +147,20 @@ class Spool:
         if writer is None:
             raise SpoolTaken(self.path, "a `pycrorm writer` drains it: stop that first")
         try:
-            with wrap_os_errors(self.path), folder_lock(self.path):
+            with wrap_os_errors(self.path), locks.folder_lock(self.path):
                 for recorder in self.recorders():
                     if recorder.alive:
                         raise SpoolTaken(recorder.path, "its process still records: end that first")
-                    if is_locked(recorder.path / DRAIN):
+                    if locks.is_locked(recorder.path / locks.DRAIN):
                         raise SpoolTaken(recorder.path, "another process drains it: wait until that has finished")
                 bound = self.log_id()
-                if bound and bound != log_id and (self.path / STORED / bound).is_dir():
-                    for numbers in (self.path / STORED / bound).glob(f"{NUMBERS}*"):  # they belong to that log
+                if bound and bound != log_id and (self.path / locks.STORED / bound).is_dir():
+                    for numbers in (self.path / locks.STORED / bound).glob(
+                        f"{locks.NUMBERS}*"
+                    ):  # they belong to that log
                         numbers.unlink()
                     with suppress(FileExistsError, NotADirectoryError):
-                        (self.path / STORED / bound).rename(self.path / STORED / log_id)
+                        (self.path / locks.STORED / bound).rename(self.path / locks.STORED / log_id)
                 write_durably(self.path / BINDING, f"{log_id}\n".encode())
         finally:
             writer.release()
@@ -205,7 +188,7 @@ def _is_recorder(path: Path) -> bool:
     if not is_folder_name(path.name):
         return False
     try:
-        (path / ALIVE).lstat()
+        (path / locks.ALIVE).lstat()
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError:  # opening the folder reports the reason; the listing must not fail for all recorders
@@ -216,7 +199,7 @@ def _is_recorder(path: Path) -> bool:
 def _is_alive(path: Path) -> bool:
     """Return whether the recorder lives; False if its lock cannot be opened, which opening the folder reports."""
     try:
-        return is_locked(path / ALIVE)
+        return locks.is_locked(path / locks.ALIVE)
     except OSError:
         return False
 
@@ -241,9 +224,9 @@ def parse_folder_name(name: str) -> FolderName:
     recorder, dot, rest = name.partition(".")
     if not dot:
         return FolderName(parse_episode_id(recorder), None)
-    if not rest.endswith(REFUSED):
+    if not rest.endswith(locks.REFUSED):
         raise ValueError(name)
-    return FolderName(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(REFUSED)))
+    return FolderName(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(locks.REFUSED)))
 
 
 def is_folder_name(name: str) -> bool:
@@ -273,15 +256,15 @@ def folder_error(folder: Path, error: Exception) -> PycrormError:
     return SpoolUnavailable(folder, f"cannot be read: {type(error).__name__}: {error}")
 
 
-def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
+def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, locks.FileLock]:
     """Create a recorder's folder, and the spool if missing; return it with its `alive`. Raises `SpoolUnavailable`."""
     folder = spool / name
-    unfinished = spool / f"{name}{MAKING}"  # draining processes ignore it
+    unfinished = spool / f"{name}{locks.MAKING}"  # draining processes ignore it
     with wrap_os_errors(spool):
-        check_file_system(spool)
-        create_spool(spool, access)
-        create_folder(unfinished)
-        alive = FileLock.take(unfinished / ALIVE)
+        locks.check_file_system(spool)
+        locks.create_spool(spool, access)
+        locks.create_folder(unfinished)
+        alive = locks.FileLock.take(unfinished / locks.ALIVE)
         if alive is None:
             raise SpoolUnavailable(unfinished, "was deleted while it was being created")
     with wrap_os_errors(folder):
@@ -297,11 +280,11 @@ def remove_folder(folder: Path) -> None:
     for number in segment_numbers(folder):  # the oldest first
         segment_path(folder, number).unlink()
     with suppress(FileNotFoundError):
-        shutil.rmtree(folder / BLOBS)
+        shutil.rmtree(folder / locks.BLOBS)
     for path in list(folder.iterdir()):
-        if path.suffix in {MAKING, TAIL}:
+        if path.suffix in {locks.MAKING, locks.TAIL}:
             path.unlink()
-    for name in (PROGRESS, DRAIN, ALIVE):
+    for name in (locks.PROGRESS, locks.DRAIN, locks.ALIVE):
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
@@ -324,8 +307,8 @@ def _is_begun(segment: Path) -> bool:
 
 def write_durably(path: Path, content: bytes) -> None:
     """Replace a file's content atomically, also across a power cut. Raises `OSError`."""
-    unfinished = path.with_name(f"{path.name}{MAKING}")
-    with os.fdopen(open_file(unfinished, os.O_WRONLY | os.O_TRUNC), "wb") as file:
+    unfinished = path.with_name(f"{path.name}{locks.MAKING}")
+    with os.fdopen(locks.open_file(unfinished, os.O_WRONLY | os.O_TRUNC), "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
@@ -385,7 +368,7 @@ class Progress:
         self._descriptor = descriptor
         self._recorded = RecorderStatus()
         self._drained = DrainStatus()
-        call_in_forked_child(self.close)
+        locks.call_in_forked_child(self.close)
 
     @classmethod
     def make(cls, folder: Path) -> Progress:
@@ -394,10 +377,10 @@ class Progress:
         It gets its name only when it is complete. Creates `drain` too: a drainer that created it could recreate a
         folder that is being deleted.
         """
-        os.close(open_file(folder / DRAIN, os.O_WRONLY))
-        path = folder / PROGRESS
+        os.close(locks.open_file(folder / locks.DRAIN, os.O_WRONLY))
+        path = folder / locks.PROGRESS
         unfinished = path.with_suffix(".making")
-        descriptor = open_file(unfinished, os.O_RDWR | os.O_TRUNC)
+        descriptor = locks.open_file(unfinished, os.O_RDWR | os.O_TRUNC)
         try:
             os.posix_fallocate(descriptor, 0, _FILE_BYTES)
             os.pwrite(descriptor, _MAGIC, 0)
@@ -415,7 +398,7 @@ class Progress:
         """Open the file in this folder; None if missing, incomplete or of another format. Raises other `OSError`."""
         flags = (os.O_RDWR if writing else os.O_RDONLY) | os.O_CLOEXEC
         try:
-            descriptor = os.open(folder / PROGRESS, flags)
+            descriptor = os.open(folder / locks.PROGRESS, flags)
         except (FileNotFoundError, NotADirectoryError):
             return None
         try:

@@ -43,23 +43,9 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_key
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import (
-    LOSES_OPEN_NODES,
-    DesignatorTypeDeclared,
-    EpisodeEnded,
-    EpisodeStarted,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectMoved,
-    ObjectRemoved,
-    PoseValue,
-    RobotValue,
-)
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
 from pycrorm_async.projections.findings import Comparison, EpisodeRange, TableCheck, TableDifference, VerifyResult
@@ -84,7 +70,10 @@ class CaseBatch(ProjectedBatch):
     """The cases of one batch of events, which it writes as one block. Implements `Batch`."""
 
     def __init__(
-        self, projection: PackedProjection, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds
+        self,
+        projection: PackedProjection,
+        declared: Mapping[str, event_types.DesignatorTypeDeclared],
+        folds: EpisodeFolds,
     ) -> None:
         super().__init__(projection, declared, folds)
         self.cases: list[Case] = []
@@ -232,7 +221,7 @@ class FeatureFields(NamedTuple):
     kind: str
 
     @classmethod
-    def of(cls, declaration: DesignatorTypeDeclared) -> FeatureFields:
+    def of(cls, declaration: event_types.DesignatorTypeDeclared) -> FeatureFields:
         named: dict[str, list[str]] = {}
         for each in declaration.fields:
             named.setdefault(each.type, []).append(each.name)
@@ -248,7 +237,7 @@ class FeatureFields(NamedTuple):
 
 
 def situation(
-    fields: FeatureFields, parameters: Mapping[str, Any], robot: RobotValue | None, world: ReplayedWorld
+    fields: FeatureFields, parameters: Mapping[str, Any], robot: event_types.RobotValue | None, world: ReplayedWorld
 ) -> tuple[Symbols, Numbers]:
     """Return the features of an action that starts with these parameters, for this robot and in this world."""
     symbols: Symbols = {}
@@ -278,7 +267,11 @@ def _add_parameters(symbols: Symbols, numbers: Numbers, fields: FeatureFields, p
 
 
 def _add_robot(
-    symbols: Symbols, numbers: Numbers, fields: FeatureFields, parameters: Mapping[str, Any], robot: RobotValue
+    symbols: Symbols,
+    numbers: Numbers,
+    fields: FeatureFields,
+    parameters: Mapping[str, Any],
+    robot: event_types.RobotValue,
 ) -> None:
     if robot.name is not None:
         symbols["robot"] = robot.name
@@ -297,7 +290,7 @@ class _Seen(NamedTuple):
 
     name: str | None
     type: str | None
-    pose: PoseValue | None
+    pose: event_types.PoseValue | None
 
 
 def _seen(value: Mapping[str, Any], world: ReplayedWorld) -> _Seen:
@@ -305,14 +298,14 @@ def _seen(value: Mapping[str, Any], world: ReplayedWorld) -> _Seen:
     identity = value.get("object")
     if identity is None:
         pose = value.get("pose")
-        return _Seen(value.get("name"), value.get("object_type"), pose and msgspec.convert(pose, PoseValue))
+        return _Seen(value.get("name"), value.get("object_type"), pose and msgspec.convert(pose, event_types.PoseValue))
     present = world.objects.get(identity)
     if present is None:
         return _Seen(world.name_of(identity), None, None)
     return _Seen(present.added.name, present.added.object_type, present.pose)
 
 
-def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: RobotValue | None) -> None:
+def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: event_types.RobotValue | None) -> None:
     if seen.type is not None:
         symbols["object_type"] = seen.type
     if seen.name is not None:
@@ -333,7 +326,7 @@ def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: RobotVal
 
 
 def _add_surroundings(
-    symbols: Symbols, identity: int | None, robot: RobotValue | None, objects: Mapping[int, WorldObject]
+    symbols: Symbols, identity: int | None, robot: event_types.RobotValue | None, objects: Mapping[int, WorldObject]
 ) -> None:
     target = objects.get(identity) if identity is not None else None
     holder = robot.object.object if robot is not None and robot.object is not None else None
@@ -360,7 +353,7 @@ def _is_near(each: WorldObject, target: WorldObject) -> bool:
 
 
 def _pose_in(
-    position: Sequence[float], orientation: Sequence[float], frame: PoseValue
+    position: Sequence[float], orientation: Sequence[float], frame: event_types.PoseValue
 ) -> tuple[float, float, float, float]:
     """Return x, y, z and yaw of a pose in the frame of another; orientations are quaternions xyzw."""
     (fx, fy, fz, fw), (at_x, at_y, at_z) = frame.orientation, frame.position
@@ -382,20 +375,20 @@ def _pose_in(
 # === episode cases ============================================================================================
 
 READS: Final = (
-    EpisodeStarted,
-    EpisodeEnded,
-    NodeStarted,
-    NodeEnded,
-    ObjectAdded,
-    ObjectRemoved,
-    ObjectMoved,
-    ObjectAttached,
-    ObjectDetached,
+    event_types.EpisodeStarted,
+    event_types.EpisodeEnded,
+    event_types.NodeStarted,
+    event_types.NodeEnded,
+    event_types.ObjectAdded,
+    event_types.ObjectRemoved,
+    event_types.ObjectMoved,
+    event_types.ObjectAttached,
+    event_types.ObjectDetached,
 )
 """The types of events that cases are made from."""
 
 
-DeclarationOf: TypeAlias = Callable[[str], DesignatorTypeDeclared | None]
+DeclarationOf: TypeAlias = Callable[[str], event_types.DesignatorTypeDeclared | None]
 """Returns the designator type of a fingerprint; None if it was never declared, or by a newer version."""
 
 
@@ -456,19 +449,19 @@ class EpisodeCases:
         for event in events:
             try:
                 happening = happening_of(event)
-                if isinstance(happening, NodeStarted):
+                if isinstance(happening, event_types.NodeStarted):
                     self._start(event, happening, declaration_of)
-                elif isinstance(happening, NodeEnded):
+                elif isinstance(happening, event_types.NodeEnded):
                     action = self._running.pop(happening.node, None)
                     if action is not None:
                         cases.append(self._end(action, happening, event.monotonic_ns))
                     else:
                         self._scopes.pop(happening.node, None)
-                elif isinstance(happening, EpisodeStarted):
+                elif isinstance(happening, event_types.EpisodeStarted):
                     self._simulated = happening.simulated
                     self._wall_at_zero_ns = event.wall_ns - event.monotonic_ns
-                elif isinstance(happening, EpisodeEnded):
-                    if happening.status in LOSES_OPEN_NODES:
+                elif isinstance(happening, event_types.EpisodeEnded):
+                    if happening.status in event_types.LOSES_OPEN_NODES:
                         cases += [each.case("LOST") for each in self._running.values()]
                     self._running.clear()
                     self._scopes.clear()
@@ -478,7 +471,7 @@ class EpisodeCases:
                 return event.sequence, fault
         return None
 
-    def _start(self, event: StoredEvent, started: NodeStarted, declaration_of: DeclarationOf) -> None:
+    def _start(self, event: StoredEvent, started: event_types.NodeStarted, declaration_of: DeclarationOf) -> None:
         number, sequence, _, _, wall_ns, monotonic_ns, payload = event
         parent = started.parent
         scope = self._running.get(parent) or self._scopes.get(parent) if parent is not None else None
@@ -516,7 +509,7 @@ class EpisodeCases:
             simulated,
         )
 
-    def _end(self, action: _Action, ended: NodeEnded, monotonic_ns: int) -> Case:
+    def _end(self, action: _Action, ended: event_types.NodeEnded, monotonic_ns: int) -> Case:
         status, failure = ended.status, ended.failure
         action.has_ended = True
         if action.scope is None:
@@ -705,7 +698,7 @@ class CaseProjection(PackedProjection):
     def episode(self) -> Any:
         return EpisodeCases(self._types)
 
-    def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
+    def batch(self, declared: Mapping[str, event_types.DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
         return CaseBatch(self, declared, folds)
 
     def check(self, result: VerifyResult) -> TableCheck:

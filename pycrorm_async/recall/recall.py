@@ -23,15 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Select, select
 
+from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import (
-    CallerError,
-    DatabaseUnavailable,
-    EpisodeParked,
-    MissingExtra,
-    PycrormError,
-    TablesOutdated,
-)
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
 from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, ObjectAdded, ObjectReference, RobotValue
@@ -45,6 +38,7 @@ from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.recall import search
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import Block, CaseLibrary, merge
 from pycrorm_async.recall.cases import (
@@ -60,20 +54,6 @@ from pycrorm_async.recall.cases import (
     situation,
 )
 from pycrorm_async.recall.columns import RESERVED, Case
-from pycrorm_async.recall.search import (
-    FEATURES_MAX,
-    Cue,
-    Forgotten,
-    Wanted,
-    check_cue,
-    closest,
-    forgotten,
-    numbers_of,
-    shortened,
-    symbols_of,
-    weights_of,
-    word,
-)
 from pycrorm_async.record.episode_writer import Emitter
 from pycrorm_async.record.event_feed import EventBuffer
 from pycrorm_async.record.plan_types import built_in_declaration, declared_type
@@ -164,7 +144,7 @@ class Recall:
             before, after, during, as_of, prohibit, only, episode, robot, tag, simulated=simulated, k=k, minimum=minimum
         )
         library = await self._reader.library(dtype_of(type), aliases_of(type))
-        words = symbols_of(has), numbers_of(near), symbols_of(lacks)
+        words = search.symbols_of(has), search.numbers_of(near), search.symbols_of(lacks)
         cue = await make_cue(library, self._reading, dtype_of(type), *words, conditions)
         return self._answer(cue, library)
 
@@ -206,12 +186,12 @@ class Recall:
         features = library.texts(dtype) | library.numbers(dtype)
         symbols = {name: each for name, each in symbols.items() if name in features and name != "object_name"}
         wanted = {name: each for name, each in numbers.items() if name in features}
-        words = symbols_of({**symbols, **has}), numbers_of({**wanted, **near})
+        words = search.symbols_of({**symbols, **has}), search.numbers_of({**wanted, **near})
         cue = await make_cue(library, self._reading, dtype, *words, (), Conditions(k=k, **conditions))
         return self._answer(cue, library)
 
-    def _answer(self, cue: Cue, library: CaseLibrary) -> Answer:
-        check_cue(cue, library)
+    def _answer(self, cue: search.Cue, library: CaseLibrary) -> Answer:
+        search.check_cue(cue, library)
         return answer(cue, library, self)
 
     async def frame(self, type: str | type | None = None, **cue: Any) -> pd.DataFrame:  # noqa: A002
@@ -221,7 +201,7 @@ class Recall:
         """
         return frame_of(await self(type, **cue))
 
-    async def forget(self, activation: float, *, dry_run: bool = False) -> Forgotten:
+    async def forget(self, activation: float, *, dry_run: bool = False) -> search.Forgotten:
         """Hide the actions in ways that were not used enough lately, from this object only; nothing is deleted.
 
         A way is a type with all its texts, as the same object, arm and grasp. Each call replaces the one before it:
@@ -233,7 +213,7 @@ class Recall:
             dry_run: only count.
         """
         if isinstance(activation, bool) or not isinstance(activation, Real) or activation != activation:
-            raise CallerError(f"activation must be a number, got {shortened(activation)}")
+            raise errors.CallerError(f"activation must be a number, got {search.shortened(activation)}")
         return await self._reader.forget(activation, self._clock.wall_ns() // 1_000, dry_run=dry_run)
 
     async def types(self) -> tuple[str, ...]:
@@ -273,7 +253,7 @@ class Recall:
             wanted = Relation(relation)
         except ValueError:
             names = ", ".join(each.value for each in Relation)
-            raise CallerError(f"{relation!r} is not a relation: give one of {names}") from None
+            raise errors.CallerError(f"{relation!r} is not a relation: give one of {names}") from None
         return (await self._reader.sequences()).related(await self.case(case), wanted)
 
     async def moment(self, case: AnyCase) -> Moment:
@@ -307,10 +287,12 @@ class Recall:
         """
         dtype = dtype_of(type)
         if dtype is None:
-            raise CallerError("give the type of the actions, as in `follows(PickUpAction)`")
+            raise errors.CallerError("give the type of the actions, as in `follows(PickUpAction)`")
         if status is not None:
-            status = member_of(TaskStatus, word(status), "status")
-        wanted = {name: word(each) for name, each in (("status", status), ("reason", reason)) if each is not None}
+            status = member_of(TaskStatus, search.word(status), "status")
+        wanted = {
+            name: search.word(each) for name, each in (("status", status), ("reason", reason)) if each is not None
+        }
         sequences = await self._reader.sequences(dtype, aliases_of(type))
         return sequences.follows(dtype, **wanted)
 
@@ -320,7 +302,7 @@ def frame_of(recalled: Answer) -> pd.DataFrame:
     try:
         pandas = import_module("pandas")
     except ImportError:
-        raise MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
+        raise errors.MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
     rows = []
     for each in recalled:
         case = each.case
@@ -431,11 +413,11 @@ class CaseReader:
             self._sequences = library, Sequences(library)
         return self._sequences[1]
 
-    async def forget(self, threshold: float, now_us: int, *, dry_run: bool) -> Forgotten:
+    async def forget(self, threshold: float, now_us: int, *, dry_run: bool) -> search.Forgotten:
         """Hide from this reader the cases of every way whose activation is now below the threshold; show all others."""
         async with self._reading:
             hidden, self._hidden = self._hidden, _NO_NODES
-            cases = forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)
+            cases = search.forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)
             self._hidden = hidden if dry_run else cases.nodes
             if self._hidden.size:
                 await self._read(changed=True)
@@ -502,7 +484,7 @@ async def check_robot(reading: Reading, robot: str) -> None:
     async with reading.session(simulated=True) as session:
         names = set((await session.scalars(select(EpisodeRobot.name).distinct())).all())
     if robot not in names:
-        raise CallerError(f"no episode has the robot {robot!r}{closest(robot, names)}")
+        raise errors.CallerError(f"no episode has the robot {robot!r}{search.closest(robot, names)}")
 
 
 async def make_cue(
@@ -510,33 +492,33 @@ async def make_cue(
     reading: Reading,
     dtype: str | None,
     has: tuple[tuple[str, str], ...],
-    near: tuple[Wanted, ...],
+    near: tuple[search.Wanted, ...],
     lacks: tuple[tuple[str, str], ...],
     conditions: Conditions,
-) -> Cue:
+) -> search.Cue:
     """Return the cue. Raises `CallerError` for a moment without a zone or an unknown node, `UnknownEpisode`."""
     numbers = await _episodes(reading, conditions)
     during = None
     if isinstance(conditions.during, tuple) and not isinstance(conditions.during, Case):
         if len(conditions.during) != 2:
-            raise CallerError(f"`during` takes a case, or two moments, got {len(conditions.during)}")
+            raise errors.CallerError(f"`during` takes a case, or two moments, got {len(conditions.during)}")
         first, last = conditions.during
         during = _start(first, library), _end(last, library)
     elif conditions.during is not None:
         case = case_of(conditions.during, library)
         if case.duration_s is None:
-            raise CallerError(f"{case.type} in episode {case.episode} has no end, so nothing happened during it")
+            raise errors.CallerError(f"{case.type} in episode {case.episode} has no end, so nothing happened during it")
         during = case.started_us, _end(case, library)
         numbers = frozenset({case.episode}) & (numbers if numbers is not None else {case.episode})
     only = dict(conditions.only or {})
     if conditions.robot is not None:
         only["robot"] = conditions.robot
-    return Cue(
+    return search.Cue(
         type=dtype,
         has=has,
         near=near,
         lacks=lacks,
-        requires=symbols_of(only),
+        requires=search.symbols_of(only),
         before_us=None if conditions.before is None else _start(conditions.before, library),
         after_us=None if conditions.after is None else _end(conditions.after, library),
         during_us=during,
@@ -549,26 +531,26 @@ async def make_cue(
     )
 
 
-def cue_like(case: Case, library: CaseLibrary) -> Cue:
+def cue_like(case: Case, library: CaseLibrary) -> search.Cue:
     """Return the situation of a case as a cue, without its outcome and without the name of its object.
 
     If there are more features than a cue can have, those with the lowest weights are left out, and counted.
     """
     unused = RESERVED | _OF_EACH_CASE | library.left_out
-    has = symbols_of({name: value for name, value in case.symbols.items() if name not in unused})
-    near = tuple(Wanted(name, value) for name, value in sorted(case.numbers.items()))
-    cue = Cue(type=case.type, has=has, near=near, simulated=case.simulated)
+    has = search.symbols_of({name: value for name, value in case.symbols.items() if name not in unused})
+    near = tuple(search.Wanted(name, value) for name, value in sorted(case.numbers.items()))
+    cue = search.Cue(type=case.type, has=has, near=near, simulated=case.simulated)
     features = [*has, *near]
-    if len(features) <= FEATURES_MAX:
+    if len(features) <= search.FEATURES_MAX:
         return cue
-    weights = [*weights_of(cue, library).words, *(1.0 for _ in near)]
-    heaviest = sorted(range(len(features)), key=lambda index: -weights[index])[:FEATURES_MAX]
+    weights = [*search.weights_of(cue, library).words, *(1.0 for _ in near)]
+    heaviest = sorted(range(len(features)), key=lambda index: -weights[index])[: search.FEATURES_MAX]
     kept = {features[index] for index in heaviest}
     return replace(
         cue,
         has=tuple(each for each in has if each in kept),
         near=tuple(each for each in near if each in kept),
-        left_out=len(features) - FEATURES_MAX,
+        left_out=len(features) - search.FEATURES_MAX,
     )
 
 
@@ -584,8 +566,10 @@ def dtype_of(designator: str | type | None) -> str | None:
     if isinstance(dtype, str):
         return dtype
     if not isinstance(designator, type):
-        raise CallerError(f"{shortened(designator)} is not a type: give a designator class, or the name of one")
-    return word(designator).removeprefix("ORM")
+        raise errors.CallerError(
+            f"{search.shortened(designator)} is not a type: give a designator class, or the name of one"
+        )
+    return search.word(designator).removeprefix("ORM")
 
 
 def aliases_of(designator: str | type | None) -> tuple[str, ...]:
@@ -597,13 +581,15 @@ def aliases_of(designator: str | type | None) -> tuple[str, ...]:
 def node_of(case: AnyCase) -> int:
     """Return the id of the node of a case. Raises `CallerError` for anything else."""
     if not isinstance(case, int | Case | RecalledCase):
-        raise CallerError(f"{shortened(case)} is not a case: give one of an answer, or the id of its node")
+        raise errors.CallerError(
+            f"{search.shortened(case)} is not a case: give one of an answer, or the id of its node"
+        )
     return case if isinstance(case, int) else case.node
 
 
 def _nodes(cases: object) -> frozenset[int]:
     if not isinstance(cases, Iterable) or isinstance(cases, Case | str):
-        raise CallerError("`prohibit` takes a list of cases")
+        raise errors.CallerError("`prohibit` takes a list of cases")
     return frozenset(map(node_of, cases))
 
 
@@ -625,7 +611,7 @@ async def _episodes(reading: Reading, conditions: Conditions) -> frozenset[int] 
         rows = (await session.execute(select(EpisodeTag.process_metadata_id, EpisodeTag.tag))).all()
     tagged = frozenset(number for number, each in rows if each == tag)
     if not tagged:
-        raise CallerError(f"no episode has the tag {tag!r}{closest(tag, {each for _, each in rows})}")
+        raise errors.CallerError(f"no episode has the tag {tag!r}{search.closest(tag, {each for _, each in rows})}")
     return tagged if numbers is None else numbers & tagged
 
 
@@ -640,7 +626,7 @@ def case_of(case: AnyCase, library: CaseLibrary) -> Case:
     if stored is None:
         key = row_key(case) if 0 < case < 2**53 else None
         place = f"event {key.sequence} of episode {key.number}" if key is not None else f"{case}"
-        raise CallerError(f"there is no case of {place}: it does not exist, is not an action, or has not ended")
+        raise errors.CallerError(f"there is no case of {place}: it does not exist, is not an action, or has not ended")
     return stored
 
 
@@ -661,12 +647,12 @@ def _moment_us(when: datetime | str) -> int:
         try:
             moment = datetime.fromisoformat(when)
         except ValueError:
-            raise CallerError(
+            raise errors.CallerError(
                 f"{when[:40]!r} is not a moment: give one as in 2026-11-20 or 2026-11-20T14:30+01:00"
             ) from None
         when = moment if moment.utcoffset() is not None else moment.replace(tzinfo=UTC)
     if when.utcoffset() is None:
-        raise CallerError(f"{when!r} has no time zone: add one, for example .replace(tzinfo=UTC)")
+        raise errors.CallerError(f"{when!r} has no time zone: add one, for example .replace(tzinfo=UTC)")
     return (when - _EPOCH) // timedelta(microseconds=1)
 
 
@@ -696,12 +682,12 @@ class DatabaseSource:
         async with log.snapshot() as connection:
             tables = await read_generation(connection, _KEY)
             if tables is None:
-                raise DatabaseUnavailable(
+                raise errors.DatabaseUnavailable(
                     f"{log.address} has no cases to recall yet (with Settings(recall=False) none are made): run"
                     " `pycrorm writer --once`"
                 )
             if tables.version != CaseProjection.version:
-                raise TablesOutdated(
+                raise errors.TablesOutdated(
                     f"{log.address}: its cases have version {tables.version} instead of {CaseProjection.version}: run"
                     f" `pycrorm rebuild {CaseProjection.name}`"
                 )
@@ -716,7 +702,7 @@ class DatabaseSource:
             return False
         if self._numbers is None or self._numbers[0] != generation:
             self._numbers = generation, select_numbers(_KEY, generation)
-        with suppress(PycrormError):  # where a rebuild has dropped the table; another fault is met again
+        with suppress(errors.PycrormError):  # where a rebuild has dropped the table; another fault is met again
             async with log.reading() as connection:
                 rows = (await connection.execute(self._numbers[1])).all()
             generations = {(number, version) for number, version, _ in rows}
@@ -744,7 +730,9 @@ def present_situation(target: Object | ObjectDesignator, action: str | type) -> 
     """
     body = target.world_object if isinstance(target, ObjectDesignator) else target
     if not isinstance(body, Object) or body not in body.world.objects:
-        raise CallerError(f"{target!r} is not an object in a world, so it has no situation: add it to a world first")
+        raise errors.CallerError(
+            f"{target!r} is not an object in a world, so it has no situation: add it to a world first"
+        )
     fields = FeatureFields.of(_declaration(action))
     # Events refer to objects by the sequence that added them: number the objects as an episode that began now would.
     sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
@@ -759,7 +747,7 @@ def _declaration(action: str | type) -> DesignatorTypeDeclared:
         return declared_type(action, strict=False).declaration
     declaration = built_in_declaration(dtype_of(action) or "")
     if declaration is None:
-        raise CallerError(f"{action!r} is not a designator class: give one, such as PickUpAction")
+        raise errors.CallerError(f"{action!r} is not a designator class: give one, such as PickUpAction")
     return declaration
 
 
@@ -848,7 +836,7 @@ class ProcessCases:
         Raises `CallerError` once the memory is closed.
         """
         if self.emitter.is_closed:
-            raise CallerError("the memory is closed, so nothing can be recalled from it: ask while it is open")
+            raise errors.CallerError("the memory is closed, so nothing can be recalled from it: ask while it is open")
         cases: list[Case] = []
         if self._buffer is None:
             self._buffer = self.emitter.feed.keep(READS, _EVENTS_MAX, self.clock)
@@ -878,7 +866,7 @@ class ProcessCases:
 
     async def _read_open(self) -> list[Case]:
         """Fold the earlier events of the open episodes; cases that are in the tables too are returned again."""
-        with suppress(EpisodeParked):  # `flush` and `status` report it; what is stored is folded here
+        with suppress(errors.EpisodeParked):  # `flush` and `status` report it; what is stored is folded here
             await self.flush()
         log = await self.log()
         cases: list[Case] = []

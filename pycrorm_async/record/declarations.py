@@ -19,6 +19,7 @@ from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.fields import (
     AcceptedFields,
@@ -30,25 +31,17 @@ from pycrorm_async.events.fields import (
     without_reserved_names,
 )
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.events.types import (
-    DesignatorTypeDeclared,
-    FieldDeclared,
-    FieldType,
-    ItemType,
-    NodeKind,
-    ObjectReference,
-    PoseValue,
-)
+from pycrorm_async.events.types import ItemType
 from pycrorm_async.record.values import Field, clean, clean_repr, cut, encoder_of, recorded_as, refuse
 from pycrorm_async.recorded_names import recorded_name
 
 RecordedKind: TypeAlias = Literal["action", "motion", "language"]
-FieldSpec: TypeAlias = FieldType | tuple[FieldType, ItemType] | type[Any]
+FieldSpec: TypeAlias = event_types.FieldType | tuple[event_types.FieldType, ItemType] | type[Any]
 """`real`; `("list", "real")`; or a Python type: `float`, an `Enum` class, `list[float]`, `Pose`."""
 
 _REASON_MAX = 500
 """Bounds the characters of the reason why a field or type cannot be declared; reasons may quote a user's names."""
-_TYPES: frozenset[str] = frozenset(get_args(FieldType))
+_TYPES: frozenset[str] = frozenset(get_args(event_types.FieldType))
 _WITHOUT_ITEMS = _TYPES - {"list", "dict"}
 _ITEMS: frozenset[str] = frozenset(get_args(ItemType))
 
@@ -68,7 +61,7 @@ class DeclaredType(NamedTuple):
     payload: bytes
     fingerprint: str
     fields: tuple[Field, ...]
-    declaration: DesignatorTypeDeclared
+    declaration: event_types.DesignatorTypeDeclared
     undeclared: Mapping[str, str] = MappingProxyType({})
     fault: str | None = None
 
@@ -104,13 +97,13 @@ def reason_text(text: str) -> str:
 
 
 def declare(
-    kind: NodeKind,
+    kind: event_types.NodeKind,
     dtype: str,
     own: Sequence[OwnField],
     *,
-    contradiction: Callable[[FieldDeclared], str | None],
+    contradiction: Callable[[event_types.FieldDeclared], str | None],
     columns: Collection[str] = (),
-    fault: Callable[[DesignatorTypeDeclared], str | None] = fault_in_declaration,
+    fault: Callable[[event_types.DesignatorTypeDeclared], str | None] = fault_in_declaration,
     **further: Any,
 ) -> Declared:
     """Declare a type with these fields.
@@ -121,7 +114,7 @@ def declare(
         fault: returns the reason why the type cannot be declared, in which case it has no payload.
         further: further fields of `DesignatorTypeDeclared`.
     """
-    accepted: list[FieldDeclared] = []
+    accepted: list[event_types.FieldDeclared] = []
     fields: list[Field] = []
     undeclared: dict[str, str] = {}
     renamed: dict[str, Renamed] = {}
@@ -140,7 +133,7 @@ def declare(
         fields.append(Field(field.name, each.read, encoder_of(field), each.shape.enum, each.path, is_object))
         if reason:
             renamed[clean(each.name)] = Renamed(field.name, reason_text(reason))
-    declaration = DesignatorTypeDeclared(kind=kind, dtype=dtype, fields=tuple(accepted), **further)
+    declaration = event_types.DesignatorTypeDeclared(kind=kind, dtype=dtype, fields=tuple(accepted), **further)
     if (because := fault(declaration)) is not None:
         return Declared(without_type(kind, dtype, because, fields), renamed)
     payload = encode(declaration)
@@ -148,10 +141,10 @@ def declare(
     return Declared(declared, renamed)
 
 
-def without_type(kind: NodeKind, dtype: str, fault: str, fields: Sequence[Field] = ()) -> DeclaredType:
+def without_type(kind: event_types.NodeKind, dtype: str, fault: str, fields: Sequence[Field] = ()) -> DeclaredType:
     """Build the record of a type that cannot be declared: its nodes keep their parameters, but have no type."""
     dtype = reason_text(dtype)
-    placeholder = DesignatorTypeDeclared(kind=kind, dtype=dtype, table="")
+    placeholder = event_types.DesignatorTypeDeclared(kind=kind, dtype=dtype, table="")
     return DeclaredType(dtype, b"", "", tuple(fields), placeholder, fault=reason_text(fault))
 
 
@@ -176,7 +169,7 @@ def declare_named(
         known_types.note_stored(built_in)
         bases, concept = tuple(bases) or built_in.bases, concept or built_in.concept
 
-    def fault(declaration: DesignatorTypeDeclared) -> str | None:
+    def fault(declaration: event_types.DesignatorTypeDeclared) -> str | None:
         if (reason := fault_in_declaration(declaration)) is not None:
             return reason
         if built_in is not None and built_in.kind != kind:
@@ -236,7 +229,7 @@ def _dtype_candidates(own: str, kind: str) -> Iterator[str]:
     yield f"{plain}{kind.title()}"
 
 
-def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTypes) -> str | None:
+def _fault_in_aliases(declaration: event_types.DesignatorTypeDeclared, known_types: KnownTypes) -> str | None:
     """Return the reason why the table of a former dtype cannot be this one's; None if it can."""
     for alias in declaration.aliases:
         for field in declaration.fields:
@@ -249,7 +242,9 @@ def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTyp
 def _unreserved(own: Sequence[OwnField]) -> dict[str, str]:
     """Return the names of fields with as many underscores as make them ones that no other field has."""
     kinds = {each.name: each.shape.kind for each in own if each.shape is not None}
-    fields = [FieldDeclared(name, column_name(name, kind), kind, SLOT_FIRST_FIELD) for name, kind in kinds.items()]
+    fields = [
+        event_types.FieldDeclared(name, column_name(name, kind), kind, SLOT_FIRST_FIELD) for name, kind in kinds.items()
+    ]
     return {name: each.name for name, each in zip(kinds, without_reserved_names(fields), strict=True)}
 
 
@@ -257,14 +252,14 @@ def _named(
     name: str,
     unreserved: str,
     shape: FieldShape,
-    contradiction: Callable[[FieldDeclared], str | None],
+    contradiction: Callable[[event_types.FieldDeclared], str | None],
     columns: Collection[str],
     taken: AcceptedFields,
-) -> tuple[FieldDeclared | None, str]:
+) -> tuple[event_types.FieldDeclared | None, str]:
     """Return the field under the first name that it may have, with the reason why it is not its own; or no field."""
     first_reason = ""
     for candidate in _candidates(name, unreserved, shape, columns):
-        field = FieldDeclared(
+        field = event_types.FieldDeclared(
             name=candidate,
             column=column_name(candidate, shape.kind),
             type=shape.kind,
@@ -292,7 +287,7 @@ def _candidates(name: str, unreserved: str, shape: FieldShape, columns: Collecti
     yield f"{plain}_{shape.kind}"
 
 
-def _fault_in_field(field: FieldDeclared, taken: AcceptedFields) -> str | None:
+def _fault_in_field(field: event_types.FieldDeclared, taken: AcceptedFields) -> str | None:
     if not field.name.isidentifier() or field.name.startswith("_"):
         return f"{cut(field.name, 100)!r} is not a valid field name"
     return taken.fault_in(field)
@@ -309,8 +304,12 @@ def _shape(spec: object) -> FieldShape | None:
         return FieldShape(spec, optional=True) if spec in _WITHOUT_ITEMS else None  # type: ignore[arg-type]  # checked
     if isinstance(spec, tuple) and len(spec) == 2 and spec[0] in ("list", "dict") and spec[1] in _ITEMS:
         return FieldShape(spec[0], optional=True, item=spec[1])
-    if isinstance(spec, type) and not isinstance(spec, Enum) and issubclass(spec, PoseValue | ObjectReference):
-        return FieldShape("pose" if issubclass(spec, PoseValue) else "object", optional=True)
+    if (
+        isinstance(spec, type)
+        and not isinstance(spec, Enum)
+        and issubclass(spec, event_types.PoseValue | event_types.ObjectReference)
+    ):
+        return FieldShape("pose" if issubclass(spec, event_types.PoseValue) else "object", optional=True)
     shape = shape_of(spec)
     return shape._replace(optional=True) if shape is not None and shape.nested is None else None
 
@@ -318,7 +317,7 @@ def _shape(spec: object) -> FieldShape | None:
 class FieldShape(NamedTuple):
     """The field type of a parameter; `nested` is a dataclass, whose fields replace the parameter."""
 
-    kind: FieldType
+    kind: event_types.FieldType
     optional: bool = False
     item: ItemType | None = None
     enum: type[Enum] | None = None
@@ -354,7 +353,7 @@ def _class_shape(kind: type) -> FieldShape | None:
     return None
 
 
-_SCALARS: tuple[tuple[type, FieldType], ...] = (
+_SCALARS: tuple[tuple[type, event_types.FieldType], ...] = (
     (bool, "boolean"),
     (int, "integer"),
     (float, "real"),
@@ -377,7 +376,7 @@ def _union_shape(hint: Any) -> FieldShape | None:
 
 
 def _container_shape(origin: type, arguments: tuple[Any, ...]) -> FieldShape | None:
-    kind: FieldType
+    kind: event_types.FieldType
     if issubclass(origin, Mapping) and len(arguments) == 2:
         key = shape_of(arguments[0])
         if key is None or key.kind not in ("text", "enum") or key.optional:
@@ -408,14 +407,14 @@ class KnownTypes:
         built_in: returns the declaration of the plan layer's own type with this dtype; None if it has none.
     """
 
-    def __init__(self, built_in: Callable[[str], DesignatorTypeDeclared | None]) -> None:
+    def __init__(self, built_in: Callable[[str], event_types.DesignatorTypeDeclared | None]) -> None:
         self._find_built_in = built_in
-        self._built_in: dict[str, DesignatorTypeDeclared | None] = {}
+        self._built_in: dict[str, event_types.DesignatorTypeDeclared | None] = {}
         self._fields_by_dtype: dict[str, dict[str, str]] = {}
         self._tables: dict[str, str] = {}
-        self._columns: dict[str, dict[str, FieldDeclared]] = {}
+        self._columns: dict[str, dict[str, event_types.FieldDeclared]] = {}
 
-    def built_in(self, dtype: str) -> DesignatorTypeDeclared | None:
+    def built_in(self, dtype: str) -> event_types.DesignatorTypeDeclared | None:
         """Return the declaration of the plan layer's own type with this dtype; None if it has none.
 
         Each answer is kept for the life of the memory, because finding that there is none searches all classes.
@@ -433,7 +432,7 @@ class KnownTypes:
         owner = self._tables.get(table.lower(), dtype)
         return f"the dtype {owner!r} already has the table {table!r}" if owner != dtype else None
 
-    def fault_in_field(self, field: FieldDeclared, table: str) -> str | None:
+    def fault_in_field(self, field: event_types.FieldDeclared, table: str) -> str | None:
         """Return the reason why this field cannot be a column of the table beside all declared ones; None if it can."""
         columns = self._columns.get(table.lower(), {})
         for name in (field.name.lower(), field.column.lower()):
@@ -465,13 +464,13 @@ class KnownTypes:
         copy._columns[name] = dict(self._columns.get(name, {}))
         return copy
 
-    def note(self, declaration: DesignatorTypeDeclared) -> None:
+    def note(self, declaration: event_types.DesignatorTypeDeclared) -> None:
         """Note a declaration of this memory."""
         fields = ((each.name, type_text(each)) for each in declaration.fields)
         self._fields_by_dtype.setdefault(declaration.dtype, {}).update(fields)
         self.note_stored(declaration)
 
-    def note_stored(self, declaration: DesignatorTypeDeclared) -> None:
+    def note_stored(self, declaration: event_types.DesignatorTypeDeclared) -> None:
         """Note a declaration, also of another process, whose table and columns the database has."""
         self._tables.setdefault(declaration.table.lower(), declaration.dtype)
         columns = self._columns.setdefault(declaration.table.lower(), {})
@@ -480,6 +479,6 @@ class KnownTypes:
             columns.setdefault(field.column.lower(), field)
 
 
-def type_text(field: FieldDeclared) -> str:
+def type_text(field: event_types.FieldDeclared) -> str:
     """Describe a field's type; an enum counts as text, because its members are stored as text."""
     return f"{'text' if field.type == 'enum' else field.type}{f' of {field.item}' if field.item else ''}"

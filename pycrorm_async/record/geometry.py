@@ -19,16 +19,8 @@ from pycrorm_async.events.codec import Heading, NotEncodable, encode, fingerprin
 from pycrorm_async.events.types import BlobReference, BoxValue, DescriptionDeclared, LinkBoxValue, MeshValue
 from pycrorm_async.record.values import MissingValues, clean, clean_repr, cut, message_of
 from pycrorm_async.settings import Settings
+from pycrorm_async.world import model_boxes
 from pycrorm_async.world.bounding_boxes import BoundingBox
-from pycrorm_async.world.model_boxes import (
-    described_mass_kg,
-    link_boxes,
-    mesh_files,
-    meshed_links,
-    shape_boxes,
-    with_mesh_files,
-    without_textures,
-)
 from pycrorm_async.world.pose import DescriptionNotLoadable
 from pycrorm_async.world.urdf_model import UrdfFault, read_model, urdf_text
 
@@ -80,13 +72,13 @@ class ReadDescription:
 
     @cached_property
     def links(self) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, visual=False)
+        return model_boxes.shape_boxes(self.description_text, visual=False)
 
     def box_in_link(self, link: str) -> BoundingBox | None:
         return self.links.get(link)
 
     def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, visual=True, links=links)
+        return model_boxes.shape_boxes(self.description_text, visual=True, links=links)
 
 
 def urdf_of(name: str, urdf: Any, missing: MissingValues) -> str | None:
@@ -107,7 +99,11 @@ def urdf_of(name: str, urdf: Any, missing: MissingValues) -> str | None:
 
 def mass_of(urdf: str | None, object_type: str) -> float | None:
     """Return the mass of a described object, as `Object.mass_kg`; None for a robot or an environment."""
-    return described_mass_kg(urdf) if urdf is not None and object_type not in ("ROBOT", "ENVIRONMENT") else None
+    return (
+        model_boxes.described_mass_kg(urdf)
+        if urdf is not None and object_type not in ("ROBOT", "ENVIRONMENT")
+        else None
+    )
 
 
 class _DeclaredDescription(NamedTuple):
@@ -158,7 +154,7 @@ class Descriptions:
             self._known_characters = 0
         files = self._files.get(text)
         if files is None:
-            files = self._files[text] = mesh_files(text)
+            files = self._files[text] = model_boxes.mesh_files(text)
             self._known_characters += len(text)
         key = text, tuple(map(_stat, files)) if files else ()
         declared = self._known.get(key)
@@ -181,18 +177,18 @@ class Descriptions:
     def _encoded(self, described: Described, files: tuple[str, ...]) -> _DeclaredDescription:
         text = described.description_text
         meshes = {file: self._mesh(Path(file)) for file in files}
-        meshed = meshed_links(text) if files else ()
+        meshed = model_boxes.meshed_links(text) if files else ()
         solid = {link: box for link in described.links if (box := described.box_in_link(link)) is not None}
         seen = described.visual_boxes([link for link in meshed if link not in solid])
         boxes = {link: _box_value(box) for link in meshed if (box := solid.get(link) or seen.get(link)) is not None}
         try:
             left_out = read_model(text).left_out
-            placed = tuple(LinkBoxValue(*each) for each in link_boxes(text, solid))
+            placed = tuple(LinkBoxValue(*each) for each in model_boxes.link_boxes(text, solid))
         except UrdfFault as fault:  # the text is recorded nevertheless
             left_out, placed = (str(fault),), ()
-        text, textures = without_textures(text)
+        text, textures = model_boxes.without_textures(text)
         if meshes:
-            text = with_mesh_files(text, {file: mesh.reference for file, mesh in meshes.items()})
+            text = model_boxes.with_mesh_files(text, {file: mesh.reference for file, mesh in meshes.items()})
         packed = base64.b64encode(zlib.compress(text.encode())).decode()
         event = DescriptionDeclared(packed, tuple(dict.fromkeys(meshes.values())), boxes, placed)
         missing = [("meshes", f"{mesh.name}: {mesh.missing}") for mesh in event.meshes if mesh.missing is not None]

@@ -14,18 +14,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from pycrorm_async.events.types import (
-    Happening,
-    JointsMoved,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
-    PoseValue,
-    RobotValue,
-)
+from pycrorm_async.events import types as event_types
 from pycrorm_async.record.episode_writer import EpisodeWriter
 from pycrorm_async.record.geometry import ReadDescription
 from pycrorm_async.record.values import PoseLike, recorded_as
@@ -44,27 +33,36 @@ class ObjectRows(Generic[K]):
         self.last = 0
         self._episode = episode
         self._emitter = episode.emitter
-        self._references: dict[K, ObjectReference] = {}
+        self._references: dict[K, event_types.ObjectReference] = {}
 
-    def reference(self, key: K) -> ObjectReference | None:
+    def reference(self, key: K) -> event_types.ObjectReference | None:
         """Return the current row of an object; None if there is none of this key."""
         return self._references.get(key)
 
     def _put_removed(self, key: K, node: int | None) -> int:
         reference = self._references.pop(key, None)
-        return self._put(lambda: ObjectRemoved(reference, node)) if reference is not None else 0
+        return self._put(lambda: event_types.ObjectRemoved(reference, node)) if reference is not None else 0
 
     def _put_joints(self, key: K, positions: Mapping[str, float], node: int | None) -> int:
         reference = self._references.get(key)
-        return self._put(lambda: JointsMoved(reference, dict(positions), node)) if reference is not None else 0
+        return (
+            self._put(lambda: event_types.JointsMoved(reference, dict(positions), node)) if reference is not None else 0
+        )
 
     def _put_attachment(
-        self, kind: type[ObjectAttached | ObjectDetached], parent: K, child: K, link: str | None, node: int | None
+        self,
+        kind: type[event_types.ObjectAttached | event_types.ObjectDetached],
+        parent: K,
+        child: K,
+        link: str | None,
+        node: int | None,
     ) -> int:
         first, second = self._references.get(parent), self._references.get(child)
         return self._put(lambda: kind(first, second, link, node)) if first is not None and second is not None else 0
 
-    def _put(self, build: Callable[[], Happening], *, row_of: K | None = None, identity: int | None = None) -> int:
+    def _put(
+        self, build: Callable[[], event_types.Happening], *, row_of: K | None = None, identity: int | None = None
+    ) -> int:
         """Build and record an event; return its sequence. Exceptions are counted, so that the change succeeds; 0 then.
 
         The event becomes the current row of the object `row_of`, and its identity too if `identity` is None.
@@ -77,7 +75,7 @@ class ObjectRows(Generic[K]):
             self._emitter.note_fault("a change of the world", error)
             return 0
         if row_of is not None:
-            self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
+            self._references[row_of] = event_types.ObjectReference(sequence if identity is None else identity, sequence)
         return sequence
 
 
@@ -96,7 +94,7 @@ class RecordedObject:
 
     name: str
     object_type: str
-    pose: PoseValue
+    pose: event_types.PoseValue
     joints: dict[str, float] = field(default_factory=dict)
     urdf: str | None = None
     color: tuple[float, float, float, float] | None = None
@@ -116,7 +114,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
         self._identities: set[int] = set()
 
-    def holds(self, reference: ObjectReference | None) -> bool:
+    def holds(self, reference: event_types.ObjectReference | None) -> bool:
         """Return whether this episode has such a row; True for None."""
         if reference is None:
             return True
@@ -126,20 +124,20 @@ class RecordedObjects(ObjectRows[Hashable]):
         """Yield the names of the objects."""
         return (each.name for each in self._objects.values())
 
-    def robot(self, key: Hashable) -> RobotValue | None:
+    def robot(self, key: Hashable) -> event_types.RobotValue | None:
         """Return the state of the object as that of the acting robot; None if there is none of this key."""
         state = self._objects.get(key)
         if state is None:
             return None
         torso = state.joints.get(state.torso_joint) if state.torso_joint is not None else None
-        return RobotValue(state.pose, state.object_type, torso, self._references.get(key), state.name)
+        return event_types.RobotValue(state.pose, state.object_type, torso, self._references.get(key), state.name)
 
     def is_at(self, key: Hashable, pose: Any) -> bool:
         """Return whether the last pose of an object is this one; False if no object has this key."""
         state = self._objects.get(key)
         return (
             state is not None
-            and (isinstance(pose, PoseValue) or recorded_as(type(pose)) == "pose")
+            and (isinstance(pose, event_types.PoseValue) or recorded_as(type(pose)) == "pose")
             and _are_at_one_place(state.pose, pose)
         )
 
@@ -148,7 +146,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         if key in self._references:
             return max(self.move(key, added.pose, node), self.turn(key, added.joints, node))
         sequence = self._put(
-            lambda: ObjectAdded(
+            lambda: event_types.ObjectAdded(
                 added.name,
                 added.object_type,
                 added.pose,
@@ -168,14 +166,14 @@ class RecordedObjects(ObjectRows[Hashable]):
             self._identities.add(sequence)
         return sequence
 
-    def move(self, key: Hashable, pose: PoseValue, node: int | None) -> int:
+    def move(self, key: Hashable, pose: event_types.PoseValue, node: int | None) -> int:
         """Write a new pose of an object, if it has changed."""
         state, reference = self._objects[key], self._references[key]
         last = state.pose
         if _are_at_one_place(pose, last):
             return 0
         sequence = self._put(
-            lambda: ObjectMoved(reference.object, state.name, state.object_type, pose, node),
+            lambda: event_types.ObjectMoved(reference.object, state.name, state.object_type, pose, node),
             row_of=key,
             identity=reference.object,
         )
@@ -194,12 +192,12 @@ class RecordedObjects(ObjectRows[Hashable]):
     def attach(self, parent: Hashable, child: Hashable, link: str | None, node: int | None) -> int:
         """Write that `child` moves with `parent`."""
         self._attached[parent, child] = link
-        return self._put_attachment(ObjectAttached, parent, child, link, node)
+        return self._put_attachment(event_types.ObjectAttached, parent, child, link, node)
 
     def detach(self, parent: Hashable, child: Hashable, node: int | None) -> int:
         """Write that `child` no longer moves with `parent`."""
         link = self._attached.pop((parent, child), None)
-        return self._put_attachment(ObjectDetached, parent, child, link, node)
+        return self._put_attachment(event_types.ObjectDetached, parent, child, link, node)
 
     def remove(self, key: Hashable, node: int | None) -> int:
         """Write that an object left the world."""
@@ -208,5 +206,5 @@ class RecordedObjects(ObjectRows[Hashable]):
         return self._put_removed(key, node)
 
 
-def _are_at_one_place(pose: PoseLike | PoseValue, other: PoseLike | PoseValue) -> bool:
+def _are_at_one_place(pose: PoseLike | event_types.PoseValue, other: PoseLike | event_types.PoseValue) -> bool:
     return pose.position == other.position and pose.orientation == other.orientation and pose.frame == other.frame

@@ -25,16 +25,7 @@ from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared
 from pycrorm_async.plan.field_types import ARGUMENTS
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.task import Performable
-from pycrorm_async.record.declarations import (
-    Declared,
-    DeclaredType,
-    KnownTypes,
-    OwnField,
-    declare,
-    shape_of,
-    type_text,
-    without_type,
-)
+from pycrorm_async.record import declarations
 from pycrorm_async.record.values import message_of
 
 OUR_PACKAGE = "pycrorm_async."
@@ -54,14 +45,16 @@ class Declarations:
         strict: raise `DeclarationRefused` for a class or field that cannot be declared, instead of omitting it.
     """
 
-    def __init__(self, known: KnownTypes, *, strict: bool = True) -> None:
+    def __init__(self, known: declarations.KnownTypes, *, strict: bool = True) -> None:
         self._strict = strict
         self._known = known
-        self.declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
+        self.declared: weakref.WeakKeyDictionary[type, declarations.DeclaredType] = weakref.WeakKeyDictionary()
         self._classes_by_name: dict[str, weakref.ref[type]] = {}
         self._classes_by_alias: dict[str, weakref.ref[type]] = {}
 
-    def of(self, designator: type[Performable], on_new: Callable[[Declared], None]) -> DeclaredType:
+    def of(
+        self, designator: type[Performable], on_new: Callable[[declarations.Declared], None]
+    ) -> declarations.DeclaredType:
         """Return the declaration of a class; before returning it for the first time, call `on_new` with it."""
         cached = self.declared.get(designator)
         if cached is not None:
@@ -76,7 +69,7 @@ class Declarations:
         self.declared[designator] = declared.type
         return declared.type
 
-    def _new(self, designator: type[Performable]) -> Declared:
+    def _new(self, designator: type[Performable]) -> declarations.Declared:
         try:
             declared = _declared(
                 designator,
@@ -92,14 +85,18 @@ class Declarations:
             if self._strict:
                 raise
             fault = f"its fields cannot be read: {type(error).__name__}: {message_of(error)}"
-            return Declared(without_type(designator.__kind__, designator.__dtype__, fault), {})
+            return declarations.Declared(
+                declarations.without_type(designator.__kind__, designator.__dtype__, fault), {}
+            )
         if fault is None:
             return declared
         if self._strict:
             raise DeclarationRefused(_path(designator), fault)
-        return Declared(without_type(designator.__kind__, designator.__dtype__, fault, kept.fields), {})
+        return declarations.Declared(
+            declarations.without_type(designator.__kind__, designator.__dtype__, fault, kept.fields), {}
+        )
 
-    def _fault_in_names(self, designator: type[Performable], declared: DeclaredType) -> str | None:
+    def _fault_in_names(self, designator: type[Performable], declared: declarations.DeclaredType) -> str | None:
         """Return the reason why another live class already has the dtype or table name; None if none has."""
         if not designator.__module__.startswith(OUR_PACKAGE):
             for other in _built_in_classes(designator.__dtype__):
@@ -139,7 +136,7 @@ def _descendants(root: type) -> Iterator[Any]:
         yield from _descendants(each)
 
 
-def declared_type(designator: type[Performable], *, strict: bool = True) -> DeclaredType:
+def declared_type(designator: type[Performable], *, strict: bool = True) -> declarations.DeclaredType:
     """Derive the declaration of one class.
 
     With `strict`, raises `DeclarationRefused`, naming class and field, for a field or class that cannot be declared.
@@ -153,7 +150,7 @@ def _declared(
     strict: bool,
     field_types: Mapping[str, str],
     classes_by_alias: Mapping[str, weakref.ref[type]],
-) -> Declared:
+) -> declarations.Declared:
     """Derive the declaration of one class.
 
     Args:
@@ -162,7 +159,7 @@ def _declared(
     """
 
     def contradiction(field: FieldDeclared) -> str | None:
-        now = type_text(field)
+        now = declarations.type_text(field)
         before = field_types.get(field.name, now)
         if before == now:
             return None
@@ -170,7 +167,7 @@ def _declared(
 
     own = list(_own_fields(designator, (), (), optional=False))
     aliases, fault = _aliases_or_fault(designator, classes_by_alias)
-    declared = declare(
+    declared = declarations.declare(
         designator.__kind__,
         designator.__dtype__,
         own,
@@ -187,7 +184,7 @@ def _declared(
     return declared
 
 
-def _refusal(designator: type, own: Sequence[OwnField], declared: Declared) -> str | None:
+def _refusal(designator: type, own: Sequence[declarations.OwnField], declared: declarations.Declared) -> str | None:
     """Return the first reason why a class is not declared as it is written; None if it is."""
     undecorated = undecorated_fields(designator)
     if undecorated and not designator.__module__.startswith(OUR_PACKAGE):
@@ -252,18 +249,20 @@ def _built_in_classes(dtype: str) -> Iterator[type[Designator]]:
             yield other
 
 
-def _own_fields(owner: type, outer: tuple[str, ...], prefix: tuple[str, ...], *, optional: bool) -> Iterator[OwnField]:
+def _own_fields(
+    owner: type, outer: tuple[str, ...], prefix: tuple[str, ...], *, optional: bool
+) -> Iterator[declarations.OwnField]:
     """Yield the parameters of a class; those of a nested dataclass take the place of the parameter."""
     for each in parameters_of(owner):
         names, path = (*outer, each.name), (*prefix, *each.path)
         name, read = "_".join(names), attrgetter(".".join(path))
-        shape = None if isinstance(each.hint, Unresolved) else shape_of(each.hint)
+        shape = None if isinstance(each.hint, Unresolved) else declarations.shape_of(each.hint)
         if shape is None:
-            yield OwnField(name, read, None, _without_column(each), path)
+            yield declarations.OwnField(name, read, None, _without_column(each), path)
         elif shape.nested is None:
-            yield OwnField(name, read, shape._replace(optional=optional or shape.optional), path=path)
+            yield declarations.OwnField(name, read, shape._replace(optional=optional or shape.optional), path=path)
         elif len(names) > _NESTED_MAX:
-            yield OwnField(name, read, None, f"is nested more than {_NESTED_MAX} deep", path)
+            yield declarations.OwnField(name, read, None, f"is nested more than {_NESTED_MAX} deep", path)
         else:
             yield from _own_fields(shape.nested, names, path, optional=optional or shape.optional)
 

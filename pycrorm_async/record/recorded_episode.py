@@ -16,20 +16,10 @@ import msgspec
 from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.reasons import UNNAMED, template_of
-from pycrorm_async.events.types import (
-    EpisodeStatus,
-    FailureValue,
-    NodeReference,
-    NodeStatus,
-    ObjectDetected,
-    ObjectReference,
-    ObjectValue,
-    PoseValue,
-    RobotValue,
-    SeenValue,
-)
+from pycrorm_async.events.types import ObjectDetected
 from pycrorm_async.record.declarations import DeclaredType
 from pycrorm_async.record.episode_writer import Emitter, EpisodeWriter, OpenEpisodes, is_of_memory, put_observation
 from pycrorm_async.record.geometry import mass_of, urdf_of
@@ -164,10 +154,10 @@ def noted(emitter: Any, event_type: str, read: Callable[P, R], /, *args: P.args,
 
 FOREVER_S = 1e8
 """The seconds that a start waits for room: three years, because a wait takes a number."""
-FailureCause: TypeAlias = BaseException | FailureValue | tuple[str, str] | str
+FailureCause: TypeAlias = BaseException | event_types.FailureValue | tuple[str, str] | str
 """A failure as an executive gives it: an exception, a pair of reason and message, or a text."""
 Convert: TypeAlias = Callable[[Any], Any]
-END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
+END_STATUSES = tuple(each for each in get_args(event_types.NodeStatus) if each != "RUNNING")
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
 
@@ -214,7 +204,7 @@ class RecordedEpisode(EpisodeWriter):
         self._episodes = episodes
         self._failures = failures
         self._calls = calls
-        self._end_status: EpisodeStatus | None = None
+        self._end_status: event_types.EpisodeStatus | None = None
         self._nodes: dict[Hashable, _Node] = {}
         self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
         self._objects = RecordedObjects(self)
@@ -229,13 +219,13 @@ class RecordedEpisode(EpisodeWriter):
     ) -> None:
         self.close(error)
 
-    def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
+    def close(self, failure: BaseException | None = None, status: event_types.EpisodeStatus | None = None) -> None:
         """End the episode. Without a failure it SUCCEEDED, and nodes that are still open are counted.
 
         They end LOST, or CANCELLED in an episode that was INTERRUPTED.
         `status` is FAILED, ERROR or INTERRUPTED, by default as for `end`.
         """
-        if isinstance(status, str) and status in get_args(EpisodeStatus):
+        if isinstance(status, str) and status in get_args(event_types.EpisodeStatus):
             self._end_status = status
         self._episodes.close(self, failure)
 
@@ -270,7 +260,7 @@ class RecordedEpisode(EpisodeWriter):
         parameters: Mapping[str, Any] = {},
         *,
         parent: Hashable | None = None,
-        robot: RobotValue | Hashable | None = None,
+        robot: event_types.RobotValue | Hashable | None = None,
     ) -> Hashable:
         """Record that a node started; return it.
 
@@ -315,11 +305,11 @@ class RecordedEpisode(EpisodeWriter):
         self._nodes[key] = node
         self._ended.pop(key, None)
 
-    def _robot(self, robot: Any) -> RobotValue | None:
+    def _robot(self, robot: Any) -> event_types.RobotValue | None:
         if robot is None:
             return None
-        if isinstance(robot, RobotValue):
-            state = struct_of(robot, RobotValue)
+        if isinstance(robot, event_types.RobotValue):
+            state = struct_of(robot, event_types.RobotValue)
             return state if self._objects.holds(state.object) else replace(state, object=None)
         if (acting := self._objects.robot(robot)) is None:
             raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
@@ -329,11 +319,11 @@ class RecordedEpisode(EpisodeWriter):
     def end(
         self,
         key: Hashable,
-        status: NodeStatus | None = None,
+        status: event_types.NodeStatus | None = None,
         failure: FailureCause | None = None,
         result: Any = None,
         *,
-        below: NodeStatus | None = None,
+        below: event_types.NodeStatus | None = None,
     ) -> Callable[[], object]:
         """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR.
 
@@ -358,14 +348,19 @@ class RecordedEpisode(EpisodeWriter):
         encoded = encode_or_missing(self._values.converted(result), self) if result is not None else None
         return lambda: self._end_open(key, own, value, encoded, lower)
 
-    def _checked_status(self, status: NodeStatus) -> NodeStatus:
+    def _checked_status(self, status: event_types.NodeStatus) -> event_types.NodeStatus:
         if status in END_STATUSES:
             return status
         self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
         return "ERROR"
 
     def _end_open(
-        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, below: NodeStatus | None
+        self,
+        key: Hashable,
+        status: event_types.NodeStatus,
+        failure: event_types.FailureValue | None,
+        result: Any,
+        below: event_types.NodeStatus | None,
     ) -> None:
         node = self._nodes.get(key)
         if node is None:
@@ -380,7 +375,11 @@ class RecordedEpisode(EpisodeWriter):
         self._end_node(node, status, failure, result)
 
     def _end_node(
-        self, node: _Node, status: NodeStatus, failure: FailureValue | None = None, result: Any = None
+        self,
+        node: _Node,
+        status: event_types.NodeStatus,
+        failure: event_types.FailureValue | None = None,
+        result: Any = None,
     ) -> None:
         self.put_end(node.sequence, status, failure, result)
         self._nodes.pop(node.key, None)
@@ -395,9 +394,9 @@ class RecordedEpisode(EpisodeWriter):
         """Return whether a node with this key has started and not ended."""
         return bool(noted(self.emitter, "NodeStarted", lambda: key in self._nodes))
 
-    def node_reference(self, key: Hashable | None = None) -> NodeReference:
+    def node_reference(self, key: Hashable | None = None) -> event_types.NodeReference:
         """Return a reference to a node for `Recording.episode(thought_by=…)`; without a known key, to the root."""
-        return NodeReference(str(self), self.node_or_root(self._find(key, "EpisodeStarted")))
+        return event_types.NodeReference(str(self), self.node_or_root(self._find(key, "EpisodeStarted")))
 
     def node_or_root(self, node: Any) -> int:
         """Return the sequence of this node or of its nearest ancestor in this episode; without a node, of the root."""
@@ -415,7 +414,7 @@ class RecordedEpisode(EpisodeWriter):
         key: Hashable,
         name: str,
         object_type: str | Enum,
-        pose: PoseLike | PoseValue,
+        pose: PoseLike | event_types.PoseValue,
         joints: Mapping[str, float] = {},
         *,
         urdf: str | PathLike[str] | None = None,
@@ -447,7 +446,7 @@ class RecordedEpisode(EpisodeWriter):
 
     @reported("ObjectMoved")
     def object_moved(
-        self, key: Hashable, pose: PoseLike | PoseValue, *, node: Hashable | None = None
+        self, key: Hashable, pose: PoseLike | event_types.PoseValue, *, node: Hashable | None = None
     ) -> Callable[[], object]:
         """Record the new pose of an object, unless it is the same."""
         if not self.closed and self._objects.is_at(key, pose):
@@ -491,7 +490,7 @@ class RecordedEpisode(EpisodeWriter):
         """Record that an object left the world."""
         return lambda: self._objects.remove(self._known(key), self._cause(node))
 
-    def reference(self, key: Hashable) -> ObjectReference | None:
+    def reference(self, key: Hashable) -> event_types.ObjectReference | None:
         """Return the current row of an object, for values that name it; None if there is none of this key.
 
         Call it again for each value: the row changes when the object moves.
@@ -514,14 +513,14 @@ class RecordedEpisode(EpisodeWriter):
     @reported("ObjectDetected")
     def detected(
         self,
-        seen: Sequence[SeenValue],
+        seen: Sequence[event_types.SeenValue],
         *,
         source: Literal["camera", "world_state"] = "camera",
         object_type: str | None = None,
         node: Hashable | None = None,
     ) -> Callable[[], object]:
         """Record a result of perception; `object_type` is the type searched for."""
-        copied = (noted(self.emitter, "ObjectDetected", struct_of, each, SeenValue) for each in seen)
+        copied = (noted(self.emitter, "ObjectDetected", struct_of, each, event_types.SeenValue) for each in seen)
         percepts = [each for each in copied if each is not None]
         event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
 
@@ -591,7 +590,7 @@ class RecordedEpisode(EpisodeWriter):
         for each in raised:
             raise each
 
-    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+    def _end_statuses(self, failure: BaseException | None) -> tuple[event_types.EpisodeStatus, event_types.NodeStatus]:
         status = self._end_status
         if status is None:
             return end_statuses(failure, self._failures)
@@ -654,18 +653,22 @@ def struct_of(value: object, kind: type[S]) -> S:
 
 def _with_unit_turn(value: S) -> S:
     """Return a pose, or a value with a pose, with a quaternion of length 1, from which a rotation is computed."""
-    if isinstance(value, PoseValue):
+    if isinstance(value, event_types.PoseValue):
         length = math.hypot(*value.orientation)
         if 0 < length < math.inf and abs(length - 1) > _UNIT_TOLERANCE:
             return replace(value, orientation=tuple(each / length for each in value.orientation))
-    elif isinstance(pose := getattr(value, "pose", None), PoseValue):
+    elif isinstance(pose := getattr(value, "pose", None), event_types.PoseValue):
         return replace(value, pose=_with_unit_turn(pose))
     return value
 
 
-def pose_of(pose: PoseLike | PoseValue) -> PoseValue:
+def pose_of(pose: PoseLike | event_types.PoseValue) -> event_types.PoseValue:
     """Copy a pose. Raises `CallerError`, also for a number that is not finite."""
-    value = struct_of(pose, PoseValue) if recorded_as(type(pose)) is None else pose_value(cast("PoseLike", pose))
+    value = (
+        struct_of(pose, event_types.PoseValue)
+        if recorded_as(type(pose)) is None
+        else pose_value(cast("PoseLike", pose))
+    )
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
         raise CallerError(f"the pose holds a number that is not finite: {clean_repr(pose)}")
     if value.time_ns not in _INTEGERS:
@@ -688,7 +691,12 @@ class ArgumentReader:
         self._missing = missing
 
     def object_of(
-        self, name: str, object_type: str | Enum, pose: PoseLike | PoseValue, joints: Mapping[str, float], **others: Any
+        self,
+        name: str,
+        object_type: str | Enum,
+        pose: PoseLike | event_types.PoseValue,
+        joints: Mapping[str, float],
+        **others: Any,
     ) -> RecordedObject:
         """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
         urdf, kind = urdf_of(name, others["urdf"], self._missing), self.text_of("object_type", object_type) or "UNKNOWN"
@@ -813,32 +821,32 @@ class RecordedValues:
                 return reference
         return self._checked(value) if isinstance(value, msgspec.Struct) else value
 
-    def failure(self, failure: object, episode: RecordedEpisode) -> FailureValue:
+    def failure(self, failure: object, episode: RecordedEpisode) -> event_types.FailureValue:
         """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
         match failure:
             case BaseException():
                 return failure_value(failure, episode, self.converted)
             case (str(), str()) | str():
                 reason, message = (UNNAMED, failure) if isinstance(failure, str) else failure
-                return FailureValue(clean(reason), clean(message))
-        return struct_of(failure, FailureValue)
+                return event_types.FailureValue(clean(reason), clean(message))
+        return struct_of(failure, event_types.FailureValue)
 
     def _checked(self, value: msgspec.Struct) -> Any:
         """Return a value of an event if it is whole, and its rows are those of this episode."""
         try:
-            if isinstance(value, PoseValue):
+            if isinstance(value, event_types.PoseValue):
                 return pose_of(value)
             whole = struct_of(value, type(value))
         except CallerError as error:
             return RefusedValue(message_of(error), value)
-        reference = whole.part_of if isinstance(whole, ObjectValue) else whole
-        if isinstance(reference, ObjectReference) and not self._objects.holds(reference):
+        reference = whole.part_of if isinstance(whole, event_types.ObjectValue) else whole
+        if isinstance(reference, event_types.ObjectReference) and not self._objects.holds(reference):
             return RefusedValue("it refers to a row that this episode does not have", value)
-        if isinstance(whole, ObjectValue) and whole.pose is not None:
+        if isinstance(whole, event_types.ObjectValue) and whole.pose is not None:
             return self._checked(whole.pose) if isinstance(self._checked(whole.pose), RefusedValue) else whole
         return whole
 
-    def _known_object(self, value: Any) -> ObjectReference | None:
+    def _known_object(self, value: Any) -> event_types.ObjectReference | None:
         try:
             return self._objects.reference(value)
         except Exception:  # noqa: BLE001  it is not hashable, so it is no key

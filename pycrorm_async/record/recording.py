@@ -11,15 +11,8 @@ from typing import Any, Self, TypeAlias, cast, get_args
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, parse_episode_id
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeReference
-from pycrorm_async.record.declarations import (
-    Declared,
-    DeclaredType,
-    FieldSpec,
-    KnownTypes,
-    RecordedKind,
-    declare_named,
-    without_type,
-)
+from pycrorm_async.record import declarations
+from pycrorm_async.record.declarations import RecordedKind
 from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
 from pycrorm_async.record.opening import (
     NO_LABELS,
@@ -38,7 +31,7 @@ _TYPES_MAX = 10_000
 
 
 _Arguments: TypeAlias = tuple[
-    RecordedKind, str, tuple[tuple[str, FieldSpec], ...], tuple[str, ...], str | None, tuple[str, ...]
+    RecordedKind, str, tuple[tuple[str, declarations.FieldSpec], ...], tuple[str, ...], str | None, tuple[str, ...]
 ]
 """The arguments of `Recording.type`, in its order."""
 
@@ -63,7 +56,7 @@ class Recording:
         self,
         emitter: Emitter,
         episodes: OpenEpisodes,
-        known_types: KnownTypes,
+        known_types: declarations.KnownTypes,
         stored: Iterable[DesignatorTypeDeclared],
         *,
         software: str,
@@ -75,8 +68,8 @@ class Recording:
         self._software = software
         self._provenance = provenance
         self._calls = OrderedCalls()
-        self._types: dict[_Arguments, DeclaredType] = {}
-        self._prepared: dict[_Arguments, tuple[Declared, tuple[str | None, int]]] = {}
+        self._types: dict[_Arguments, declarations.DeclaredType] = {}
+        self._prepared: dict[_Arguments, tuple[declarations.Declared, tuple[str | None, int]]] = {}
         self._lock = threading.RLock()
         for each in stored:
             known_types.note_stored(each)
@@ -85,12 +78,12 @@ class Recording:
         self,
         kind: RecordedKind,
         dtype: str,
-        fields: Mapping[str, FieldSpec] = MappingProxyType({}),
+        fields: Mapping[str, declarations.FieldSpec] = MappingProxyType({}),
         *,
         bases: Sequence[str] = (),
         concept: str | None = None,
         aliases: Sequence[str] = (),
-    ) -> DeclaredType:
+    ) -> declarations.DeclaredType:
         """Declare a type of node once, and return it; the same arguments return the same type.
 
         A part that cannot be declared is counted as missing, with the reason, and never raises. A field that
@@ -122,7 +115,7 @@ class Recording:
         return declared or _undeclared(kind, dtype)
 
     def prepare(
-        self, kind: RecordedKind, dtype: str, fields: Mapping[str, FieldSpec], *, bases: Sequence[str] = ()
+        self, kind: RecordedKind, dtype: str, fields: Mapping[str, declarations.FieldSpec], *, bases: Sequence[str] = ()
     ) -> None:
         """Derive a type ahead, so that `type` with the same arguments only has to write it, in a third of the time.
 
@@ -130,7 +123,7 @@ class Recording:
         """
         try:
             table = self.known_types.table_of(dtype)
-            declared = declare_named(kind, dtype, fields, self.known_types.copy_of(table), bases=bases)
+            declared = declarations.declare_named(kind, dtype, fields, self.known_types.copy_of(table), bases=bases)
             # One with another name depends on other tables than its own.
             if declared.dtype is None and declared.type.payload and len(self._prepared) < _TYPES_MAX:
                 state = self.known_types.state_of(table)
@@ -142,11 +135,11 @@ class Recording:
         self,
         kind: RecordedKind,
         dtype: str,
-        fields: tuple[tuple[str, FieldSpec], ...],
+        fields: tuple[tuple[str, declarations.FieldSpec], ...],
         bases: tuple[str, ...],
         concept: str | None,
         aliases: tuple[str, ...],
-    ) -> DeclaredType:
+    ) -> declarations.DeclaredType:
         if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
             raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
         declared, state = self._prepared.pop((kind, dtype, fields, bases, concept, aliases), (None, None))
@@ -156,7 +149,9 @@ class Recording:
                 known.note_stored(built_in)
             known.note(declared.type.declaration)
         else:
-            declared = declare_named(kind, dtype, dict(fields), known, bases=bases, concept=concept, aliases=aliases)
+            declared = declarations.declare_named(
+                kind, dtype, dict(fields), known, bases=bases, concept=concept, aliases=aliases
+            )
         own, missing = declared.type, self.emitter.missing
         for name, reason in own.undeclared.items():
             missing.note(own.dtype, name, reason)
@@ -251,7 +246,7 @@ class Recording:
 def _arguments(
     kind: RecordedKind,
     dtype: str,
-    fields: Mapping[str, FieldSpec],
+    fields: Mapping[str, declarations.FieldSpec],
     bases: Sequence[str],
     concept: str | None = None,
     aliases: Sequence[str] = (),
@@ -267,12 +262,12 @@ def _is_whole(reference: Any) -> bool:
         return False
 
 
-def _undeclared(kind: object, dtype: object) -> DeclaredType:
+def _undeclared(kind: object, dtype: object) -> declarations.DeclaredType:
     """Return the type of nodes whose type cannot be declared."""
     valid: RecordedKind = "action"
     if isinstance(kind, str) and kind in get_args(RecordedKind):
         valid = cast("RecordedKind", kind)
-    return without_type(valid, clean_repr(dtype), "its type could not be declared")
+    return declarations.without_type(valid, clean_repr(dtype), "its type could not be declared")
 
 
 # === episode block ============================================================================================

@@ -21,27 +21,9 @@ from typing import Any
 import msgspec
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import (
-    DescriptionDeclared,
-    EpisodeEnded,
-    Happening,
-    JointsMoved,
-    LocationResolved,
-    MeshValue,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectDetected,
-    ObjectMoved,
-    ObjectRemoved,
-    Observed,
-    PoseValue,
-    StateSampled,
-)
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay, ReplayedWorld
 from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
@@ -87,29 +69,29 @@ class EpisodePage(EpisodeReplay):
         self._unlisted = dict.fromkeys(_LISTS, 0)
         self._series: dict[str, Track] = {}
 
-    def read(self, event: StoredEvent) -> Happening | None:
+    def read(self, event: StoredEvent) -> event_types.Happening | None:
         """Apply the next event, as `EpisodeReplay.read`, and keep what the page shows of it."""
         happening = super().read(event)
         sequence = self._texts.sequence = event.sequence
         if sequence >= self._first:
             self._times.append(self.at.since_ns // 1000)
         match happening:
-            case NodeStarted():
+            case event_types.NodeStarted():
                 self._start_row(sequence)
-            case NodeEnded() if sequence < self._first:
+            case event_types.NodeEnded() if sequence < self._first:
                 del self.nodes[happening.node], self._rows[happening.node]
-            case NodeEnded():
+            case event_types.NodeEnded():
                 self._end_row(sequence, happening.node)
-            case EpisodeEnded(status="LOST"):
+            case event_types.EpisodeEnded(status="LOST"):
                 for start in [each for each in self._rows if each not in self._ended_nodes]:
                     self._end_row(sequence, start)
-            case ObjectDetected() if sequence >= self._first:
+            case event_types.ObjectDetected() if sequence >= self._first:
                 self._list("detections", _detection(sequence, happening))
-            case Observed() if sequence >= self._first:
+            case event_types.Observed() if sequence >= self._first:
                 self._observed(sequence, happening)
-            case LocationResolved() if sequence >= self._first:
+            case event_types.LocationResolved() if sequence >= self._first:
                 self._list("locations", _location(sequence, happening))
-            case Happening():
+            case event_types.Happening():
                 self.tracks.read(sequence, happening)
         return happening
 
@@ -138,7 +120,7 @@ class EpisodePage(EpisodeReplay):
         self._rows[start] = [start, end, *self._rows[start][2:6], *texts]
         self._ended_nodes[start] = sequence
 
-    def _observed(self, sequence: int, observed: Observed) -> None:
+    def _observed(self, sequence: int, observed: event_types.Observed) -> None:
         text = msgspec.json.encode(observed.values).decode()
         if len(text) > _VALUES_MAX:
             text = f"{text[:_VALUES_MAX]}… ({len(text) - _VALUES_MAX:,} more characters)"
@@ -236,7 +218,7 @@ class EpisodePage(EpisodeReplay):
         }
 
 
-def model_name(added: ObjectAdded) -> str:
+def model_name(added: event_types.ObjectAdded) -> str:
     """Return the name of an object's model: its fingerprint, or for an assumed one what the assumption rests on."""
     return added.description or f"{added.object_type} {added.name}"
 
@@ -262,7 +244,7 @@ def _tracks(
     return {name: each for name, each in columns.items() if each[0]}
 
 
-def _detection(sequence: int, detected: ObjectDetected) -> dict[str, Any]:
+def _detection(sequence: int, detected: event_types.ObjectDetected) -> dict[str, Any]:
     seen = [
         [each.name, each.object_type, rounded(each.pose.position), each.visible, each.confidence]
         for each in detected.seen
@@ -271,7 +253,7 @@ def _detection(sequence: int, detected: ObjectDetected) -> dict[str, Any]:
     return {"at": sequence, "node": detected.node or 0, "source": detected.source, "type": wanted, "seen": seen}
 
 
-def _location(sequence: int, resolved: LocationResolved) -> dict[str, Any]:
+def _location(sequence: int, resolved: event_types.LocationResolved) -> dict[str, Any]:
     refused: dict[str, int] = {}
     for each in resolved.refused:
         refused[each.reason] = refused.get(each.reason, 0) + 1
@@ -446,24 +428,24 @@ class ObjectTracks:
         self.numbers = 0
         self._removals_from: int | None = None
 
-    def read(self, sequence: int, happening: Happening) -> None:
+    def read(self, sequence: int, happening: event_types.Happening) -> None:
         """Apply an event of the world; events of unknown objects have no effect."""
         match happening:
-            case ObjectAdded():
+            case event_types.ObjectAdded():
                 self._add(sequence, happening)
-            case ObjectMoved():
+            case event_types.ObjectMoved():
                 self._move(happening.object, sequence, happening.pose)
-            case JointsMoved():
+            case event_types.JointsMoved():
                 self._set_joints(happening.object.object, sequence, happening.joints)
-            case ObjectAttached():
+            case event_types.ObjectAttached():
                 pair = [happening.parent.object, happening.child.object, happening.link or "", sequence, 0]
                 self.attachments.append(pair)
-            case ObjectDetached():
+            case event_types.ObjectDetached():
                 self._detach(sequence, parent=happening.parent.object, child=happening.child.object)
-            case ObjectRemoved():
+            case event_types.ObjectRemoved():
                 self._remove(happening.object.object, sequence)
                 return
-            case StateSampled():
+            case event_types.StateSampled():
                 channels = self.samples.setdefault(happening.object.object, {})
                 for name, value in happening.channels.items():
                     channels.setdefault(name, Track(self._first)).set(sequence, round(value, 4))
@@ -472,13 +454,13 @@ class ObjectTracks:
                 return
         self._removals_from = None
 
-    def _add(self, sequence: int, added: ObjectAdded) -> None:
+    def _add(self, sequence: int, added: event_types.ObjectAdded) -> None:
         self.objects[sequence] = TracksOfObject(Track(self._first))
         self._move(sequence, sequence, added.pose)
         self._set_joints(sequence, sequence, added.joints)
         self.full_until = None
 
-    def _move(self, identity: int, sequence: int, pose: PoseValue) -> None:
+    def _move(self, identity: int, sequence: int, pose: event_types.PoseValue) -> None:
         if (moved := self.objects.get(identity)) is not None:
             moved.poses.set(sequence, rounded((*pose.position, *pose.orientation)))
             self.numbers += 7
@@ -590,7 +572,7 @@ class Meshes:
         self._log = log
         self._left = _TRIANGLES_MAX
 
-    async def model(self, description: DescriptionDeclared) -> dict[str, Any]:
+    async def model(self, description: event_types.DescriptionDeclared) -> dict[str, Any]:
         """Return the model of a description: `meshes` has its triangles, `boxes` why others are drawn as boxes."""
         meshes: dict[str, Any] = {}
         refused: list[str] = []
@@ -607,7 +589,7 @@ class Meshes:
             return model
         return {**model, "meshes": meshes, "boxes": _note(refused)}
 
-    async def _triangles(self, mesh: MeshValue) -> Triangles:
+    async def _triangles(self, mesh: event_types.MeshValue) -> Triangles:
         """Return the triangles of a mesh file. Raises `ValueError` with the reason why it has a box instead."""
         if mesh.content is None:
             raise ValueError(mesh.missing or "its content was not recorded")

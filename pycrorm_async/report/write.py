@@ -26,15 +26,7 @@ import msgspec
 import numpy as np
 from sqlalchemy import func, select
 
-from pycrorm_async.errors import (
-    CallerError,
-    DamageError,
-    DatabaseForeign,
-    DatabaseUnavailable,
-    LogDamaged,
-    PycrormError,
-    TablesPending,
-)
+from pycrorm_async import errors
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.orm import RootFailure, TaskTreeNode
 from pycrorm_async.query.frames import TRIED, times_with
@@ -138,11 +130,11 @@ async def overview(
     folder = file.with_name(f"{file.stem}.pages")
     refuse_existing(file, force=force)
     if folder.exists() and not (force and folder.is_dir()):
-        raise CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
+        raise errors.CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
     choice = choice or EpisodeChoice()
     episodes, total = await newest_episodes(reading, choice)
     if not episodes:
-        raise CallerError(await absence_of_episodes(reading, choice))
+        raise errors.CallerError(await absence_of_episodes(reading, choice))
     title = f"Episodes: {choice}" if str(choice) else "Episodes"
     successes = await success_documents(reading, [each.number for each in episodes], plots)
     with _folder_of_pages(folder):
@@ -180,9 +172,9 @@ async def _write_pages(
     for each in episodes:
         try:
             await report(reading, each, folder / page_name(each.number), force=force, similar=similar)
-        except (LogDamaged, DatabaseForeign) as error:
+        except (errors.LogDamaged, errors.DatabaseForeign) as error:
             unreadable[each.number] = str(error)
-        except (PycrormError, OSError):
+        except (errors.PycrormError, OSError):
             raise
         except Exception as error:  # noqa: BLE001  whatever an episode holds, the others get their pages
             unreadable[each.number] = f"its page cannot be made: {type(error).__name__}: {error}"
@@ -356,7 +348,7 @@ async def outcomes_of(reading: Reading, number: int) -> dict[str, str]:
     query = select(RootFailure.sequence, RootFailure.outcome).where(RootFailure.process_metadata_id == number)
     try:
         rows = await reading.rows(query, simulated=True)
-    except (DatabaseUnavailable, TablesPending):  # the page shows the events alone
+    except (errors.DatabaseUnavailable, errors.TablesPending):  # the page shows the events alone
         return {}
     return {str(row.sequence): row.outcome for row in rows}
 
@@ -418,9 +410,9 @@ class SimilarCases:
         """
         try:
             library = await self._reader.library()
-        except (DatabaseUnavailable, TablesPending):
+        except (errors.DatabaseUnavailable, errors.TablesPending):
             return None
-        except DamageError as fault:
+        except errors.DamageError as fault:
             return {"fault": str(fault)}
         cases = _cases_of(library, episode, starts)
         nodes: dict[str, dict[str, Any]] = {}
@@ -552,7 +544,7 @@ async def success_documents(
         return [await _document(reading, numbers, each) for each in plots]
     try:
         return [await _document(reading, numbers, each) for each in _PICK_UPS]
-    except CallerError:  # no pick-up, or more than are counted
+    except errors.CallerError:  # no pick-up, or more than are counted
         return []
 
 

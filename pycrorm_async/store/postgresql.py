@@ -45,25 +45,9 @@ from sqlalchemy.dialects.postgresql.asyncpg import PGDialect_asyncpg
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async import errors
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import (
-    DatabaseError,
-    DatabaseForeign,
-    DatabaseUnavailable,
-    TablesUntrusted,
-    TablesWithheld,
-)
-from pycrorm_async.store import postgresql_errors, schema
-from pycrorm_async.store.dialect import (
-    LOG_CHANGES,
-    Dialect,
-    Insertion,
-    LogIdentity,
-    Migrations,
-    RowsByTable,
-    StoredOn,
-    TableState,
-)
+from pycrorm_async.store import dialect, postgresql_errors, schema
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql_engine import PATH, STRANGER, WARNING
 from pycrorm_async.store.postgresql_engine import TABLES_SCHEMA as TABLES
@@ -78,8 +62,8 @@ from pycrorm_async.store.stored import Span, StoredEvent
 SYSTEM_COLUMNS = frozenset("xmin xmax cmin cmax ctid tableoid".split())
 """Names that every table reserves for system columns; a view may use them."""
 
-CLAIM = f"SELECT pg_catalog.pg_try_advisory_lock({LOG_CHANGES + 1})"
-RELEASE = f"SELECT pg_catalog.pg_advisory_unlock({LOG_CHANGES + 1})"
+CLAIM = f"SELECT pg_catalog.pg_try_advisory_lock({dialect.LOG_CHANGES + 1})"
+RELEASE = f"SELECT pg_catalog.pg_advisory_unlock({dialect.LOG_CHANGES + 1})"
 
 # Less than deadlock_timeout, so that the session that changes tables fails, never a reader.
 WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
@@ -210,7 +194,7 @@ _VERSION_MIN = 14
 _RESTORING = "a restore may be running; try again when it has finished"
 
 
-class PostgreSQL(Dialect):
+class PostgreSQL(dialect.Dialect):
     """Implements `Dialect`. Events are inserted by COPY; an append locks its episodes' rows until COMMIT."""
 
     syntax = PGDialect_asyncpg()  # type: ignore[no-untyped-call]  # SQLAlchemy's
@@ -225,7 +209,7 @@ class PostgreSQL(Dialect):
     faults = postgresql_errors.FAULTS
 
     @cached_property
-    def migrations(self) -> Migrations:
+    def migrations(self) -> dialect.Migrations:
         # Numbers come from a sequence, so that no robot waits for another one's transaction; a rollback leaves a hole.
         before = (f"CREATE SCHEMA {LOG}", f"CREATE SEQUENCE {LOG}.episode_number", _REFUSAL)
         first, *later = super().migrations
@@ -249,32 +233,32 @@ class PostgreSQL(Dialect):
             statements.append(f"ALTER INDEX {LOG}.{table.name}_pkey SET (fillfactor = 100)")
         return statements
 
-    async def lock_log_changes(self, connection: AsyncConnection, key: int = LOG_CHANGES) -> None:
+    async def lock_log_changes(self, connection: AsyncConnection, key: int = dialect.LOG_CHANGES) -> None:
         await connection.exec_driver_sql(f"SELECT pg_catalog.pg_advisory_xact_lock({key})")
 
-    async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
+    async def find_log(self, connection: AsyncConnection, name: str) -> dialect.LogIdentity | None:
         version: Any = (connection.dialect.server_version_info or (0,))[0]
         if version < _VERSION_MIN:
-            raise DatabaseUnavailable(f"{name}: PostgreSQL {_VERSION_MIN} or newer is needed, this is {version}")
+            raise errors.DatabaseUnavailable(f"{name}: PostgreSQL {_VERSION_MIN} or newer is needed, this is {version}")
         names = set((await connection.exec_driver_sql(TABLE_NAMES)).scalars())
         if not names:
             return None
         if "pycrorm_log" not in names:
             if names.isdisjoint(each.name for each in schema.FORMAT_1):
-                raise DatabaseForeign(f"{name} has a schema {LOG!r} of another program: it has no pycrorm_log")
-            raise DatabaseUnavailable(f"{name}: the table pycrorm_log is missing: {_RESTORING}")
+                raise errors.DatabaseForeign(f"{name} has a schema {LOG!r} of another program: it has no pycrorm_log")
+            raise errors.DatabaseUnavailable(f"{name}: the table pycrorm_log is missing: {_RESTORING}")
         row = (await self.execute(connection, schema.SELECT_LOG)).one_or_none()
         if row is None:
-            raise DatabaseUnavailable(f"{name}: the table pycrorm_log is empty: {_RESTORING}")
-        return LogIdentity._make(row)
+            raise errors.DatabaseUnavailable(f"{name}: the table pycrorm_log is empty: {_RESTORING}")
+        return dialect.LogIdentity._make(row)
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         # One message, bypassing SQLAlchemy, in the transaction that an earlier statement through SQLAlchemy began.
         await (await _driver(connection)).execute("; ".join(statements))
 
-    async def table_state(self, connection: AsyncConnection, table: Table) -> TableState:
+    async def table_state(self, connection: AsyncConnection, table: Table) -> dialect.TableState:
         row = (await connection.exec_driver_sql(TABLE_STATE, (f"{LOG}.{table.name}",))).one()
-        return TableState._make(row)
+        return dialect.TableState._make(row)
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:  # noqa: ARG002
         return list((await connection.exec_driver_sql(NEW_NUMBERS, (count,))).scalars())
@@ -285,13 +269,13 @@ class PostgreSQL(Dialect):
         if number < above:
             await connection.exec_driver_sql(SKIP_NUMBERS, (above - number,))
 
-    async def stored_on(self, connection: AsyncConnection) -> StoredOn:
+    async def stored_on(self, connection: AsyncConnection) -> dialect.StoredOn:
         configured = (await connection.exec_driver_sql(SYNCHRONOUS_STANDBYS)).scalar_one().strip()
         if not configured:
-            return StoredOn(1)
+            return dialect.StoredOn(1)
         # Without pg_read_all_stats their states are null, but COMMIT still waits for them.
         names = tuple((await connection.exec_driver_sql(SELECT_SYNCHRONOUS)).scalars())
-        return StoredOn(1 + max(1, _confirming(configured)), names or (configured,))
+        return dialect.StoredOn(1 + max(1, _confirming(configured)), names or (configured,))
 
     async def force_durable_commit(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql(WRITE_AHEAD)
@@ -325,13 +309,13 @@ class PostgreSQL(Dialect):
         parameters = (name, "CREATE" if to_change else "USAGE")
         is_withheld, exists, stranger, login = tuple((await connection.exec_driver_sql(HAS_TABLE, parameters)).one())
         if stranger is not None:
-            raise TablesUntrusted(
+            raise errors.TablesUntrusted(
                 f"the tables belong to {stranger}, whose members could run their code with the rights of {login}:"
                 f" fold with a login that is a member of {stranger} and has no right to the log, read with one of"
                 " pycrorm_reader"
             )
         if is_withheld:
-            raise TablesWithheld(
+            raise errors.TablesWithheld(
                 f"{login} may {'not change' if to_change else 'neither read nor change'} the tables: fold with"
                 " `pycrorm writer` and a login that may, read with one of pycrorm_reader"
             )
@@ -352,7 +336,7 @@ class PostgreSQL(Dialect):
         names = await connection.exec_driver_sql(IN_VIEWS_SCHEMA, (list(views),))
         strangers = list(names.scalars())
         if strangers:
-            raise DatabaseError(
+            raise errors.DatabaseError(
                 f"{VIEWS}.{strangers[0]} does not belong to the memory, which replaces the schema {VIEWS}"
                 " with every change of its views: move it to another schema"
             )
@@ -411,10 +395,10 @@ class PostgreSQL(Dialect):
             connection, [f"CREATE TEMP VIEW {_quote(name)} AS {text}" for name, text in views.items()]
         )
 
-    async def insertion(self, rows: RowsByTable) -> Insertion:
+    async def insertion(self, rows: dialect.RowsByTable) -> dialect.Insertion:
         return rows  # the driver encodes a row while the server stores the previous ones
 
-    async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
+    async def insert(self, connection: AsyncConnection, insertion: dialect.Insertion) -> None:
         # In the transaction that an earlier statement through SQLAlchemy began.
         driver = await _driver(connection)
         for (table, columns), some in insertion.items():

@@ -27,16 +27,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable
-from pycrorm_async.store import schema, sqlite_engine
-from pycrorm_async.store.dialect import (
-    Dialect,
-    Expected,
-    Insertion,
-    LogIdentity,
-    RowRefused,
-    RowsByTable,
-    TableState,
-)
+from pycrorm_async.store import dialect, schema, sqlite_engine
 from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, Connection, claim
 from pycrorm_async.store.stored import Span, StoredEvent
 
@@ -51,7 +42,7 @@ SELECT json_group_array(json_array(sequence, type, version, wall_ns, monotonic_n
 FROM event WHERE episode = ? AND sequence > ? AND sequence <= ?"""
 
 
-class SQLite(Dialect):
+class SQLite(dialect.Dialect):
     """Implements `Dialect`. A writing transaction holds the only write lock from its beginning."""
 
     syntax = SQLiteDialect_aiosqlite()
@@ -99,20 +90,20 @@ class SQLite(Dialect):
             if mode != "wal":
                 raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log existing (a network folder?)")
 
-    async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
+    async def find_log(self, connection: AsyncConnection, name: str) -> dialect.LogIdentity | None:
         tables_and_logs: Sequence[int] = (await connection.exec_driver_sql(_COUNT_TABLES)).one()
         if tables_and_logs[0] == 0:
             return None
         if tables_and_logs[1] == 0:
             raise DatabaseForeign(f"{name} is a database of another program: it has tables but no pycrorm_log")
-        return LogIdentity._make((await self.execute(connection, schema.SELECT_LOG)).one())
+        return dialect.LogIdentity._make((await self.execute(connection, schema.SELECT_LOG)).one())
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         await (await _driver(connection)).execute_in_turn((statement, ()) for statement in statements)
 
-    async def table_state(self, connection: AsyncConnection, table: Table) -> TableState:
+    async def table_state(self, connection: AsyncConnection, table: Table) -> dialect.TableState:
         exists = await self.has_table(connection, table.name)
-        return TableState(exists, not exists, exists, exists)
+        return dialect.TableState(exists, not exists, exists, exists)
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
         taken = (await self.execute(connection, schema.SELECT_NUMBER_MAX)).scalar_one()
@@ -147,7 +138,7 @@ class SQLite(Dialect):
             await connection.exec_driver_sql("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,))
         ).first() is not None
 
-    async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
+    async def expect(self, connection: AsyncConnection, tables: Sequence[dialect.Expected]) -> None:
         # Counting the rows would hold the write lock all that time. Without statistics the planner assumes equal sizes:
         # a query by status began with all nodes and took four times as long.
         await connection.exec_driver_sql(f"ANALYZE {_quote(tables[0].table)}")  # creates the planner's table
@@ -192,7 +183,7 @@ class SQLite(Dialect):
         creations = [f"CREATE TEMP VIEW {_quote(name)} AS {text}" for name, text in views.items()]
         await self.execute_all(connection, creations)
 
-    async def insertion(self, rows: RowsByTable) -> Insertion:
+    async def insertion(self, rows: dialect.RowsByTable) -> dialect.Insertion:
         insertions = []
         for (table, columns), some in rows.items():
             into = f"INSERT INTO {_quote(table)} ({', '.join(map(_quote, columns))}) VALUES "
@@ -201,7 +192,7 @@ class SQLite(Dialect):
                 await asyncio.sleep(0)
         return insertions
 
-    async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
+    async def insert(self, connection: AsyncConnection, insertion: dialect.Insertion) -> None:
         with _rows_refused():
             await (await _driver(connection)).execute_in_turn(insertion)
 
@@ -260,7 +251,7 @@ def _rows_refused() -> Iterator[None]:
     try:
         yield
     except (sqlite3.DataError, sqlite3.IntegrityError, OverflowError) as error:
-        raise RowRefused(str(error)) from error
+        raise dialect.RowRefused(str(error)) from error
 
 
 # === multi row insert =========================================================================================

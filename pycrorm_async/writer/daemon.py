@@ -29,29 +29,11 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple, TypeVar
 
-from pycrorm_async.errors import (
-    DatabaseForeign,
-    DatabaseUnavailable,
-    FilesError,
-    PycrormError,
-    SpoolForeign,
-    TablesPending,
-)
+from pycrorm_async import errors
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.drain import (
-    PATIENT,
-    Append,
-    Backoff,
-    ClaimedSource,
-    Drain,
-    Log,
-    ScanResult,
-    SourceScanner,
-    TablesPort,
-    run_to_completion,
-)
+from pycrorm_async.writer import drain
 
 STOP_S: Final = 10.0
 """Bounds the time of stopping. Records not stored by then stay in their folders for the next daemon."""
@@ -59,7 +41,7 @@ _SCAN_INTERVAL_S: Final = 0.2
 """Interval between two scans for folders, and so the delay until a new recorder is drained."""
 _CONFIRM_S: Final = 5.0
 """Interval at which the database confirms the last stored events: one row, in a tenth of a millisecond."""
-_REST = Backoff(first_s=1.0, longest_s=60.0)
+_REST = drain.Backoff(first_s=1.0, longest_s=60.0)
 """Pauses before the next attempt at a folder that could not be drained: a damaged one, or one without dead letters."""
 
 
@@ -75,9 +57,9 @@ class Daemon:
 
     def __init__(
         self,
-        log: Log,
-        tables: TablesPort,
-        scan: SourceScanner,
+        log: drain.Log,
+        tables: drain.TablesPort,
+        scan: drain.SourceScanner,
         *,
         settings: Settings,
         report: Callable[[str], None],
@@ -104,7 +86,7 @@ class Daemon:
         Returns at most `STOP_S` later unless a database call blocks; no record is lost by that. Raises `SpoolForeign`
         if the spool was bound to another database, and `DatabaseForeign` if the database was replaced by another.
         """
-        foreign: SpoolForeign | DatabaseForeign | None = None
+        foreign: errors.SpoolForeign | errors.DatabaseForeign | None = None
         async with asyncio.TaskGroup() as tasks:
             folding = tasks.create_task(self._fold_repeatedly(), name="pycrorm fold")
             confirming = tasks.create_task(self._confirm_repeatedly(), name="pycrorm confirm")
@@ -115,13 +97,13 @@ class Daemon:
                         task = tasks.create_task(self._serve(source), name=f"pycrorm drain {source.name}")
                         drains.add(task)
                         task.add_done_callback(drains.discard)
-                except (SpoolForeign, DatabaseForeign) as error:
+                except (errors.SpoolForeign, errors.DatabaseForeign) as error:
                     foreign = error
                 await _wait(stop, _SCAN_INTERVAL_S)
             for each in self._serving.values():
                 each.source.finish()
             if drains:
-                patience_s = 0.0 if isinstance(foreign, DatabaseForeign) else STOP_S
+                patience_s = 0.0 if isinstance(foreign, errors.DatabaseForeign) else STOP_S
                 _, late = await asyncio.wait(drains, timeout=patience_s)
                 for task in late:
                     task.cancel()
@@ -135,26 +117,26 @@ class Daemon:
 
     # --- claiming ----------------------------------------------------------------------------------------
 
-    async def _claim_sources(self) -> list[ClaimedSource]:
+    async def _claim_sources(self) -> list[drain.ClaimedSource]:
         now_s = self._now_s()
         resting = {name for name, (_, until_s) in self._rests.items() if until_s > now_s}
         excluded = self._serving.keys() | resting
-        result = ScanResult([], {})
+        result = drain.ScanResult([], {})
 
         def scan() -> None:
             nonlocal result
             result = self._scan(excluded)
 
         try:
-            await run_to_completion(asyncio.to_thread(scan))
+            await drain.run_to_completion(asyncio.to_thread(scan))
         except asyncio.CancelledError:
             for source in result.held:  # free for the next daemon, possibly in this process
-                with suppress(PycrormError):
+                with suppress(errors.PycrormError):
                     source.release()
             raise
-        except SpoolForeign:
+        except errors.SpoolForeign:
             raise
-        except FilesError as error:
+        except errors.FilesError as error:
             self._report_if_new(f"cannot scan for recorders: {error}", "scan")
             return []
         self._last_lines.pop("scan", None)
@@ -172,7 +154,7 @@ class Daemon:
 
     # --- one recorder -----------------------------------------------------------------------------------------
 
-    async def _serve(self, source: ClaimedSource) -> None:
+    async def _serve(self, source: drain.ClaimedSource) -> None:
         name = source.name
         tracker = VisibilityTracker(
             source,
@@ -194,7 +176,7 @@ class Daemon:
         except Exception as error:  # noqa: BLE001 - reported and retried; must not stop the other recorders
             fault = _one_line(error)
         finally:
-            await run_to_completion(self._release(tracker, fault))
+            await drain.run_to_completion(self._release(tracker, fault))
 
     async def _append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         return await self._availability.observe(self._log.append(records))
@@ -210,7 +192,7 @@ class Daemon:
                 )
             if fault is None:
                 self._report(f"recorder {name} {outcome}; {state.records} events stored")
-        except PycrormError as error:
+        except errors.PycrormError as error:
             fault = fault or str(error)
         del self._serving[name]
         self._recorders += 1
@@ -238,12 +220,12 @@ class Daemon:
                     await self._publish_visibility()
             except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
                 attempt += 1
-                if isinstance(error, TablesPending):
+                if isinstance(error, errors.TablesPending):
                     self._publish_pending(str(error))
-                if not isinstance(error, DatabaseUnavailable):
+                if not isinstance(error, errors.DatabaseUnavailable):
                     self._report_if_new(f"the tables cannot be brought up to date: {_one_line(error)}", "fold")
                 self._appended_events.set()
-                await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0.0)
+                await asyncio.sleep(drain.PATIENT.pause_s(attempt, self._randomness()) or 0.0)
             else:
                 attempt = 0
                 self._last_lines.pop("fold", None)
@@ -255,7 +237,7 @@ class Daemon:
                 await self._availability.observe(self._log.confirm())
                 self._last_lines.pop("confirm", None)
             except Exception as error:  # noqa: BLE001 - reported and retried
-                if not isinstance(error, DatabaseUnavailable):
+                if not isinstance(error, errors.DatabaseUnavailable):
                     self._report_if_new(f"stored events cannot be confirmed: {_one_line(error)}", "confirm")
             await asyncio.sleep(_CONFIRM_S)
 
@@ -274,7 +256,7 @@ class Daemon:
         for tracker in trackers:
             try:
                 publish(tracker)
-            except FilesError as error:  # the drain meets the same disk error and reports it
+            except errors.FilesError as error:  # the drain meets the same disk error and reports it
                 self._report(f"recorder {tracker.source.name}: {error}")
 
     # --- reports --------------------------------------------------------------------------------------
@@ -311,7 +293,7 @@ async def _wait(event: asyncio.Event, seconds: float) -> None:
 
 def _one_line(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, PycrormError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, errors.PycrormError) else f"{type(error).__name__}: {text}"
 
 
 # === availability =============================================================================================
@@ -340,7 +322,7 @@ class Availability:
         called_s = self._now_s()
         try:
             result = await call
-        except DatabaseUnavailable as error:
+        except errors.DatabaseUnavailable as error:
             self._note_failure(called_s, str(error))
             raise
         self._note_success(called_s)
@@ -379,15 +361,15 @@ class VisibilityTracker:
 
     def __init__(
         self,
-        source: ClaimedSource,
-        append: Append,
+        source: drain.ClaimedSource,
+        append: drain.Append,
         *,
         settings: Settings,
         on_append: Callable[[], None],
         report: Callable[[str], None],
     ) -> None:
         self.source = source
-        self.drain = Drain(source, append, settings=settings, on_append=self._track, report=report)
+        self.drain = drain.Drain(source, append, settings=settings, on_append=self._track, report=report)
         self._on_append = on_append
         # Of each batch its last position, and each episode's last sequence up to it.
         self._invisible: deque[tuple[int, dict[str, int]]] = deque()

@@ -32,15 +32,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol, TypeAlias, TypeVar
 
-from pycrorm_async.errors import (
-    DamageError,
-    DatabaseError,
-    DatabaseUnavailable,
-    FilesError,
-    InternalError,
-    PycrormError,
-    TablesPending,
-)
+from pycrorm_async import errors
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
@@ -52,7 +44,7 @@ async def retry(
     operation: Callable[[], Awaitable[_T]],
     *,
     backoff: Backoff,
-    on_unavailable: Callable[[DatabaseUnavailable], None] = lambda _: None,
+    on_unavailable: Callable[[errors.DatabaseUnavailable], None] = lambda _: None,
     randomness: Callable[[], float] = random.random,
     sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
 ) -> _T:
@@ -61,7 +53,7 @@ async def retry(
     while True:
         try:
             return await operation()
-        except DatabaseUnavailable as error:
+        except errors.DatabaseUnavailable as error:
             attempt += 1
             on_unavailable(error)
             pause_s = backoff.pause_s(attempt, randomness())
@@ -160,7 +152,7 @@ class Drain:
         self._sleep = sleep
         self.state = DrainState(source.name)  # replaced in one step, because any thread may read it
         self._acknowledge_max: int | None = None  # no position above it is acknowledged
-        self.stuck: FilesError | DamageError | None = None
+        self.stuck: errors.FilesError | errors.DamageError | None = None
         """Why the source could not keep refused records; no position from them on is acknowledged."""
         self._changed = asyncio.Condition()
         self._finished = False
@@ -213,7 +205,7 @@ class Drain:
         self.state = self.state._replace(unavailable=None)
         return refusals
 
-    def _mark_unavailable(self, error: DatabaseUnavailable) -> None:
+    def _mark_unavailable(self, error: errors.DatabaseUnavailable) -> None:
         self.state = self.state._replace(retries=self.state.retries + 1, unavailable=str(error), last_error=str(error))
 
     async def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
@@ -229,7 +221,7 @@ class Drain:
     async def _keep_refused(self, records: Sequence[Record], refused: Mapping[str, str]) -> None:
         try:
             kept_elsewhere = await run_to_completion(asyncio.to_thread(self._source.dead_letter, records))
-        except (FilesError, DamageError) as error:
+        except (errors.FilesError, errors.DamageError) as error:
             self._acknowledge_max, self.stuck = records[0].position - 1, error
             episode, reason = next(iter(refused.items()))
             refusal = f"episode {episode} was refused: {reason}; its events cannot be kept as dead letters: {error}"
@@ -486,7 +478,7 @@ class DrainSummary:
     """
 
     drained: tuple[DrainState, ...]
-    failed: Mapping[str, PycrormError]
+    failed: Mapping[str, errors.PycrormError]
     folded: int
     stopped: Mapping[str, str]
     pending: str | None = None
@@ -505,19 +497,19 @@ async def drain_once(
     five attempts; stored events stay stored.
     """
     drained: list[DrainState] = []
-    failed: dict[str, PycrormError] = {}
+    failed: dict[str, errors.PycrormError] = {}
     for source in sources:
         drain = Drain(
             source, destination.append, settings=settings, backoff=BRIEF, on_append=partial(on_append, source)
         )
         try:
             await drain.run()
-        except DatabaseError:
+        except errors.DatabaseError:
             raise
-        except PycrormError as error:
+        except errors.PycrormError as error:
             failed[source.name] = error
         except Exception as error:  # noqa: BLE001 - reported for this source; must not stop the next
-            failed[source.name] = InternalError(f"recorder {source.name} cannot be drained: {error!r}")
+            failed[source.name] = errors.InternalError(f"recorder {source.name} cannot be drained: {error!r}")
         if drain.stuck is not None:
             failed[source.name] = drain.stuck
         drained.append(drain.state)
@@ -525,7 +517,7 @@ async def drain_once(
     folded, pending = 0, None
     try:
         folded = await retry(destination.fold, backoff=BRIEF)
-    except TablesPending as error:
+    except errors.TablesPending as error:
         pending = str(error)
     stopped = await retry(destination.stopped, backoff=BRIEF)
     refused = {episode: reason for each in drained for episode, reason in each.refused.items()}

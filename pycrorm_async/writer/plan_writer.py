@@ -16,14 +16,7 @@ from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from typing import NamedTuple, TypeVar
 
-from pycrorm_async.errors import (
-    DatabaseError,
-    DatabaseUnavailable,
-    EpisodeParked,
-    FlushTimeout,
-    InternalError,
-    TablesPending,
-)
+from pycrorm_async import errors
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import (
     PATIENT,
@@ -127,13 +120,13 @@ class BackgroundWriter:
             await patience.run(self._flush(position), name="pycrorm flush")
         except PatienceEnded:
             reason = self._drain.state.unavailable or self._fold_error or TOO_MANY_EVENTS
-            raise FlushTimeout(patience.limit_s, reason) from None
+            raise errors.FlushTimeout(patience.limit_s, reason) from None
 
     async def _flush(self, position: int) -> None:
         reached = await self._drain.reached(position)
         self._raise_failure()
         if not reached:
-            raise InternalError(f"the queue ended before position {position}")
+            raise errors.InternalError(f"the queue ended before position {position}")
         await self._fold()
         await self._raise_stopped()
 
@@ -165,7 +158,7 @@ class BackgroundWriter:
         stopped = {**self._drain.state.refused, **await self._retry(self._destination.stopped)}
         new_reasons = {episode: reason for episode, reason in stopped.items() if episode not in self._stopped_before}
         if new_reasons:
-            raise EpisodeParked(new_reasons)
+            raise errors.EpisodeParked(new_reasons)
 
     async def _fold(self) -> None:
         async with self._folding:
@@ -183,7 +176,7 @@ class BackgroundWriter:
     def _note_append(self, _: object) -> None:
         self._appended_events.set()
 
-    def _mark_unavailable(self, error: DatabaseUnavailable) -> None:
+    def _mark_unavailable(self, error: errors.DatabaseUnavailable) -> None:
         self._fold_error = str(error)
 
     async def _fold_when_idle(self) -> None:
@@ -265,7 +258,7 @@ class DelegatedWriter:
         """
         hindrance = await self._wait(position, undrained_s_max=math.inf, on_poll=self._raise_failure)
         if hindrance is not None:
-            raise FlushTimeout(self._settings.flush_timeout_s, hindrance)
+            raise errors.FlushTimeout(self._settings.flush_timeout_s, hindrance)
         self._raise_stopped()
 
     async def close(self) -> None:
@@ -326,7 +319,7 @@ class DelegatedWriter:
         """Raise the drainer's reason if it had to stop; a drainer that still runs only reports a refused episode."""
         reason = self._status.note.failure
         if reason is not None and not self._queue.is_drained:
-            raise DatabaseError(f"{reason}; everything recorded is safe in the spool")
+            raise errors.DatabaseError(f"{reason}; everything recorded is safe in the spool")
 
     def _describe_rest(self, position: int) -> str:
         status = self._status
@@ -347,12 +340,12 @@ class DelegatedWriter:
     def _raise_stopped(self) -> None:
         stopped = dict(self._status.note.stopped)
         if stopped:
-            raise EpisodeParked(stopped)
+            raise errors.EpisodeParked(stopped)
         if (pending := self._status.note.pending) is not None:
             if not self._is_pending_logged:
                 self._is_pending_logged = True
                 _log.warning("the tables do not show what is stored: %s", pending)
-            raise TablesPending(pending)
+            raise errors.TablesPending(pending)
 
 
 # === writer thread ============================================================================================
@@ -487,9 +480,9 @@ class WriterThread:
         writer = self._opened.result(timeout=0)
         return Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
 
-    def _timeout_error(self) -> FlushTimeout:
+    def _timeout_error(self) -> errors.FlushTimeout:
         reason = self.state.queue.unavailable or TOO_MANY_EVENTS
-        return FlushTimeout(self._settings.flush_timeout_s, f"closed with work left: {reason}")
+        return errors.FlushTimeout(self._settings.flush_timeout_s, f"closed with work left: {reason}")
 
     def _request_stop(self, *, cancel: bool) -> None:
         if self._ended.done() or self._loop is None or self._stop is None or self._work is None:
@@ -545,4 +538,4 @@ class WriterThread:
             patience = Patience(timeout_s, progress=lambda: answers.count)
             return await patience.run(answers.counted(opening), name="pycrorm open destination")
         except PatienceEnded:
-            raise DatabaseUnavailable(f"the database did not answer within {timeout_s:g} s") from None
+            raise errors.DatabaseUnavailable(f"the database did not answer within {timeout_s:g} s") from None

@@ -154,7 +154,7 @@ async def test_an_episode_that_cannot_be_folded_leaves_the_list_of_the_others_an
             raise TypeError("broken")
         real(event, *others)
 
-    monkeypatch.setattr(verification, "fold_happening", fold)
+    monkeypatch.setattr("pycrorm_async.projections.fold.fold_happening", fold)
     log = await EventLog.open(DatabaseAddress.parse(url), create=False)
     try:
         found = await verification.verify(log)

@@ -15,11 +15,11 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "pycrorm_async"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-CODE_LINES_MAX = 44_250
+CODE_LINES_MAX = 43_630
 """Bounds the lines of code of the package: lower it when the package gets smaller, and never raise it."""
-IMPORT_LINES_MAX = 4_620
+IMPORT_LINES_MAX = 3_800
 """Bounds those of them that are import statements; 4 to 9 % of all are usual in packages of this size."""
-FILE_LINES_MAX = 950
+FILE_LINES_MAX = 940
 CIRCLES = {
     ("memory", "pycrorm_async"),  # the package imports `Memory` on first use; a memory records the package's version
 }

@@ -36,7 +36,6 @@ from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.motions import simulated_robot
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
 from pycrorm_async.plan.task import current_node
-from pycrorm_async.record import geometry
 from pycrorm_async.record.plan_recorder import Episode, current_episode
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
@@ -335,7 +334,7 @@ async def test_a_fault_is_counted_and_the_object_is_recorded(monkeypatch: pytest
     def broken(_: str) -> tuple[str, ...]:
         raise RuntimeError("no parser\x00")
 
-    monkeypatch.setattr(geometry, "mesh_files", broken)
+    monkeypatch.setattr("pycrorm_async.world.model_boxes.mesh_files", broken)
     with recorder_case() as case, case.episode(), BulletWorld():
         Object("box", ObjectType.GENERIC_OBJECT, box(0))
     assert [(each.name, each.description) for each in added(case)] == [("box", None)]

@@ -169,7 +169,7 @@ def test_a_full_page_names_the_next_window(
 ) -> None:
     notes: list[str] = []
     monkeypatch.setattr(document, "_NODES_MAX", 2)
-    monkeypatch.setattr(command, "note", notes.append)
+    monkeypatch.setattr("pycrorm_async.cli.output.note", notes.append)
     url = f"sqlite:///{recorded / 'pycrorm.db'}"
     page = tmp_path / "page.html"
     command.report(episode="1", chosen=Chosen(), out=page, first=first, last=last, place=Place(url))
