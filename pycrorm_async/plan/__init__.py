@@ -68,7 +68,6 @@ from pycrorm_async.plan.language import (
 from pycrorm_async.plan.locations import (
     AccessingLocation,
     CostmapLocation,
-    DatabaseCostmapLocation,
     Location,
     LocationDesignator,
     ObjectRelativeLocation,
@@ -100,6 +99,7 @@ from pycrorm_async.plan.objects import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
+from pycrorm_async.plan.remembered_locations import DatabaseCostmapLocation
 from pycrorm_async.plan.retry import Retry, SimulatedTaskTree
 from pycrorm_async.plan.task import CollectedTree, TaskTreeNode, collected_tree
 from pycrorm_async.task_status import TaskStatus
