@@ -636,7 +636,6 @@ class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
     __tablename__ = "task_tree_node"
     _unmapped: ClassVar[dict[str, dict[str, str]]] = {
         "robot_type": {"storage": "text", "after": "torso_height"},
-        "parameters": {"storage": "json", "after": "simulated"},
     }
 
     id: Mapped[int] = mapped_column(primary_key=True)

@@ -25,6 +25,7 @@ import sqlalchemy as sa
 from sqlalchemy import text
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
+from sqlalchemy.sql.selectable import NamedFromClause
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
@@ -45,6 +46,8 @@ from pycrorm_async.world.pose import ObjectType
 # Poses and objects are joined as outer joins (see the section "joins").
 
 _POSE = "x y z qx qy qz qw"
+_SLOT_BITS: Final = SLOT_MAX.bit_length()
+_NUMBER_BITS: Final = SEQUENCE_MAX.bit_length() + _SLOT_BITS
 
 
 def _planner_hint(fact: sa.ColumnElement[bool]) -> sa.ColumnElement[bool]:
@@ -120,7 +123,7 @@ def _policy(node: sa.Table) -> sa.ScalarSelect[Any]:
     These are a `MoveAndPickUpAction`, and a `BatchRolloutAction`, which alone names it in episodes of version 0.1.0.
     """
     tried, batch = node.alias("tried"), node.alias("batch")
-    named = [member(each.c.parameters, "policy") for each in (tried, batch)]
+    named = [member(parameters_of(each), "policy") for each in (tried, batch)]
     return (
         sa.select(sa.func.coalesce(*named))
         .select_from(tried)
@@ -236,6 +239,32 @@ def member(document: sa.ColumnElement[Any], name: str) -> sa.ColumnElement[str]:
     """Return the member of this name of a document of JSON, as text; NULL if the document has none."""
     assert name.isidentifier(), name
     return _Member(document, sa.literal_column(f"'$.{name}'"))
+
+
+_STARTED_BY: Final = (
+    f"event.episode = ({{row}}.id >> {_NUMBER_BITS}) AND event.sequence = ({{row}}.id >> {_SLOT_BITS}) & {SEQUENCE_MAX}"
+)
+_PARAMETERS_SQLITE: Final = (
+    "(SELECT CASE WHEN json_valid(payload) THEN json_extract(payload, '$.parameters') END"  # noqa: S608
+    f" FROM event WHERE {_STARTED_BY})"
+)
+_PARAMETERS_POSTGRESQL: Final = (
+    "(SELECT CASE WHEN payload LIKE '{{%}}' THEN CAST(CAST(payload AS json) -> 'parameters' AS text) END"  # noqa: S608
+    f" FROM event WHERE {_STARTED_BY})"
+)
+"""The parameters of the node in `row`, as recorded; null where the event is damaged. Their key has one place in all
+versions of the event."""
+
+
+def parameters_of(nodes: NamedFromClause) -> sa.ColumnElement[str]:
+    """Return the recorded parameters of nodes as JSON, read from the log by one lookup a node.
+
+    A table of the nodes would repeat what the log and the tables of their types have: a seventh of a memory's size.
+    """
+    recorded = sql_of(
+        sa.Text(), *(each.format(row=nodes.name) for each in (_PARAMETERS_SQLITE, _PARAMETERS_POSTGRESQL))
+    )
+    return sa.func.coalesce(recorded, "{}")
 
 
 def event_of(row: sa.ColumnElement[int]) -> sa.ColumnElement[int]:
@@ -354,12 +383,10 @@ def _literal(value: str | float | None) -> str:
 # Path, object, arm and outcome are found by climbing from the failed node to the root, one lookup by primary key
 # for each ancestor. A query that does not select them does not climb: both databases compute only the columns they
 # need. The object and the arm are those of the nearest node that has such a parameter, because a motion that failed
-# often has neither while the action around it has both. They are read from the recorded parameters of these nodes,
-# since a lookup in the leaf tables would need one subquery for every type of a memory.
+# often has neither while the action around it has both. They are read from the recorded parameters of these nodes in
+# the log, since a lookup in the leaf tables would need one subquery for every type of a memory.
 
 _FAILED = (TaskStatus.FAILED.name, TaskStatus.ERROR.name)
-_SLOT_BITS = SLOT_MAX.bit_length()
-_NUMBER_BITS = SEQUENCE_MAX.bit_length() + _SLOT_BITS
 
 _CLIMB = """WITH RECURSIVE up(id, parent_id, path, status, depth) AS (
  SELECT {node}.id, {node}.parent_id, coalesce({node}.dtype, {node}.kind), {node}.status, 0
@@ -368,9 +395,9 @@ _CLIMB = """WITH RECURSIVE up(id, parent_id, path, status, depth) AS (
  FROM up {above})"""
 _PATH = f"({_CLIMB} SELECT path FROM up ORDER BY depth DESC LIMIT 1)"  # noqa: S608  constants only, also below
 _STARTED = """WITH RECURSIVE up(id, parent_id, parameters, depth) AS (
- SELECT {node}.id, {node}.parent_id, {node}.parameters, 0
+ SELECT {node}.id, {node}.parent_id, {of_node}, 0
  UNION ALL
- SELECT above.id, above.parent_id, above.parameters, up.depth + 1 FROM up {above})
+ SELECT above.id, above.parent_id, {of_above}, up.depth + 1 FROM up {above})
  SELECT {value} FROM up"""
 _NEAREST = "ORDER BY up.depth LIMIT 1"
 _ABOVE_SQLITE = "JOIN {node} AS above ON above.id = up.parent_id"
@@ -418,18 +445,20 @@ def root_failures(tables: TablesByName) -> sa.Select[*tuple[Any, ...]]:
     def climbing(text: str) -> tuple[str, str]:
         return sql(text, _ABOVE_SQLITE), sql(text, _ABOVE_POSTGRESQL)
 
-    def nearest(value: str, condition: str, above: str) -> str:
-        return f"({sql(_STARTED, above, value=sql(value))} {condition} {_NEAREST})"
+    def nearest(value: str, condition: str, above: str, parameters: str) -> str:
+        of = {"of_node": parameters.format(row=nodes.name), "of_above": parameters.format(row="above")}
+        return f"({sql(_STARTED, above, value=sql(value), **of)} {condition} {_NEAREST})"
 
-    object_ = sql_of(
-        sa.Text(),
-        nearest(_OBJECT_SQLITE, f", {_FIELDS_SQLITE}", _ABOVE_SQLITE),
-        nearest(_OBJECT_POSTGRESQL, f", {_FIELDS_POSTGRESQL}", _ABOVE_POSTGRESQL),
-    )
-    arm = sql_of(
-        sa.Text(),
-        nearest(_ARM_SQLITE, f"WHERE {_ARM_SQLITE} IS NOT NULL", _ABOVE_SQLITE),
-        nearest(_ARM_POSTGRESQL, f"WHERE {_ARM_POSTGRESQL} IS NOT NULL", _ABOVE_POSTGRESQL),
+    def nearest_on_each(sqlite: tuple[str, str], postgresql: tuple[str, str]) -> sa.ColumnElement[str]:
+        return sql_of(
+            sa.Text(),
+            nearest(*sqlite, _ABOVE_SQLITE, _PARAMETERS_SQLITE),
+            nearest(*postgresql, _ABOVE_POSTGRESQL, _PARAMETERS_POSTGRESQL),
+        )
+
+    object_ = nearest_on_each((_OBJECT_SQLITE, f", {_FIELDS_SQLITE}"), (_OBJECT_POSTGRESQL, f", {_FIELDS_POSTGRESQL}"))
+    arm = nearest_on_each(
+        (_ARM_SQLITE, f"WHERE {_ARM_SQLITE} IS NOT NULL"), (_ARM_POSTGRESQL, f"WHERE {_ARM_POSTGRESQL} IS NOT NULL")
     )
     return sa.select(
         nodes.c.id,
@@ -494,7 +523,7 @@ _ABOUT_POSTGRESQL = f"""coalesce(CASE WHEN strpos(substr(up.parameters, 2), '{{'
 _SUCCEEDED = TaskStatus.SUCCEEDED.name
 _FAILED_SQL = ", ".join(f"'{each}'" for each in _FAILED)
 _AGAIN = f"""up.status IN ({_FAILED_SQL}) AND up.kind <> 'language' AND EXISTS (SELECT 1 FROM (
- SELECT later.id, later.parent_id, later.parameters FROM {{node}} AS later
+ SELECT later.id, later.parent_id, {{of_later}} AS parameters FROM {{node}} AS later
  WHERE later.{EPISODE} = {{node}}.{EPISODE} AND {{later_dtype}} = up.dtype AND later.status = '{_SUCCEEDED}'
   AND later.id > {_FIRST_ID} + (CAST(up.end_sequence AS bigint) << {_SLOT_BITS}) AND later.id < (
    SELECT CASE WHEN within.kind <> 'language' OR within.status NOT IN ({_FAILED_SQL})
@@ -504,11 +533,13 @@ _AGAIN = f"""up.status IN ({_FAILED_SQL}) AND up.kind <> 'language' AND EXISTS (
  WHERE {{later_about}} = up.about AND up.parent_id IN (WITH RECURSIVE around(id, parent_id) AS (
   SELECT later.id, later.parent_id UNION ALL SELECT above.id, above.parent_id FROM around {{around}})
   SELECT around.parent_id FROM around))"""  # noqa: S608
-_UP = "id, parent_id, kind, dtype, status, parameters, end_sequence"
+_UP = "id, parent_id, kind, dtype, status, end_sequence"
+_COMPARED = f"CASE WHEN {{row}}.status IN ({_FAILED_SQL}) AND {{row}}.kind <> 'language' THEN {{parameters}} END"
+"""The parameters of the nodes that a later one is compared with; those of others are not read."""
 _OUTCOME = f"""CASE WHEN {{node}}.status IN ({_FAILED_SQL}) THEN coalesce((
- WITH RECURSIVE up({_UP}, depth) AS (
-  SELECT {", ".join(f"{{node}}.{each}" for each in _UP.split(", "))}, 0 UNION ALL
-  SELECT {", ".join(f"above.{each}" for each in _UP.split(", "))}, up.depth + 1 FROM up {{above}}
+ WITH RECURSIVE up({_UP}, parameters, depth) AS (
+  SELECT {", ".join(f"{{node}}.{each}" for each in _UP.split(", "))}, {{of_node}}, 0 UNION ALL
+  SELECT {", ".join(f"above.{each}" for each in _UP.split(", "))}, {{of_above}}, up.depth + 1 FROM up {{above}}
   WHERE up.status <> '{_SUCCEEDED}')
  SELECT judged.outcome FROM (SELECT up.depth, CASE
    WHEN up.status = '{_SUCCEEDED}' AND up.kind <> 'language' THEN 'ignored'
@@ -528,16 +559,19 @@ def outcome_of(nodes: sa.Table) -> sa.ColumnElement[str]:
     reading all nodes would not count beside it.
     """
 
-    def sql(above: str, about: str, offers: str, later_dtype: str) -> str:
+    def sql(above: str, about: str, offers: str, later_dtype: str, parameters: str) -> str:
         joined = above.format(node=nodes.name)
+        rows = {"of_node": nodes.name, "of_above": "above"}
+        of = {name: _COMPARED.format(row=row, parameters=parameters.format(row=row)) for name, row in rows.items()}
         later = {"later_about": about.replace("up.", "later."), "later_dtype": later_dtype}
+        later["of_later"] = parameters.format(row="later")
         ways = {"above": joined, "around": joined.replace("up.", "around."), "offers": offers}
-        return _OUTCOME.format(node=nodes.name, about=about, **later, **ways)
+        return _OUTCOME.format(node=nodes.name, about=about, **later, **of, **ways)
 
     return sql_of(
         sa.Text(),
-        sql(_ABOVE_SQLITE, _ABOUT_SQLITE, _OFFERS_SQLITE, "later.dtype"),
-        sql(_ABOVE_POSTGRESQL, _ABOUT_POSTGRESQL, _OFFERS_POSTGRESQL, "later.dtype || ''"),
+        sql(_ABOVE_SQLITE, _ABOUT_SQLITE, _OFFERS_SQLITE, "later.dtype", _PARAMETERS_SQLITE),
+        sql(_ABOVE_POSTGRESQL, _ABOUT_POSTGRESQL, _OFFERS_POSTGRESQL, "later.dtype || ''", _PARAMETERS_POSTGRESQL),
     )
 
 

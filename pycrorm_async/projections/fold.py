@@ -47,7 +47,6 @@ from pycrorm_async.projections.node_row import (
     DTYPE,
     ID,
     KIND,
-    PARAMETERS,
     PARENT_ID,
     PROCESS_METADATA_ID,
     ROBOT,
@@ -201,7 +200,6 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     parameter_rows: ParameterRows = []
     designator = designators.of(started)
     leaf = designator.rows(event, node, started.parameters, parameter_rows) if designator is not None else ()
-    parameters = json_text(started.parameters) if started.parameters else None
     parent = row_of(number, started.parent) if started.parent is not None else None
     robot = started.robot
     robot_object = row_of(number, robot.object.row) if robot is not None and robot.object is not None else None
@@ -225,7 +223,6 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     if designator is not None:
         columns[DTYPE] = designator.dtype
         columns[KIND] = designator.kind
-        columns[PARAMETERS] = parameters
         rows.leaves.setdefault(designator.leaf, []).append(leaf)
         for table, each in parameter_rows:
             rows.inserts[table].append(each)

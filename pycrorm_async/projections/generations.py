@@ -62,7 +62,7 @@ from pycrorm_async.projections.views import Tables, ViewDefinition, projection_v
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
-PROJECTION_VERSION = 9
+PROJECTION_VERSION = 10
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"

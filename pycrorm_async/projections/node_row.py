@@ -31,12 +31,11 @@ from pycrorm_async.projections import columns
     ROBOT_OBJECT_ID,
     ROBOT,
     SIMULATED,
-    PARAMETERS,
-) = range(21)
+) = range(20)
 assert [each.lower() for each in globals() if each.isupper()] == [*columns.CORE["task_tree_node"]], "the order differs"
 
 OUTCOME: Final = slice(REASON, RESULT + 1)
 """The columns reason to result."""
-RUNNING: Final[list[Any]] = [None] * (PARAMETERS + 1)
+RUNNING: Final[list[Any]] = [None] * (SIMULATED + 1)
 """The row of a node that has started, to be copied and filled."""
 RUNNING[STATUS], RUNNING[SIMULATED] = "RUNNING", False

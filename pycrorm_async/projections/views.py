@@ -224,9 +224,10 @@ def _designator_type(_tables: Tables, unreadable_declarations: tuple[str, ...]) 
 def _task_tree_node(tables: Tables) -> sa.Select[Any]:
     nodes = tables["task_tree_node"]
     action_id = sa.case((nodes.c.dtype.is_not(None), nodes.c.id), else_=sa.null())
-    columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
     outcome = derived_views.outcome_of(nodes).label("outcome")
-    return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome)
+    return select(
+        *columns_in_order(nodes), *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome
+    )
 
 
 def _sequence(rows: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
@@ -271,7 +272,7 @@ def _designator(tables: Tables, unusual_lineages: tuple[tuple[str, str], ...]) -
         nodes.c.dtype,
         nodes.c.kind,
         robot_state_id.label("robot_state_id"),
-        sa.func.coalesce(nodes.c.parameters, "{}").label("parameters"),
+        derived_views.parameters_of(nodes).label("parameters"),
         lineage.label("lineage"),
         *_course(nodes),
     ).where(nodes.c.dtype.is_not(None))
@@ -287,8 +288,13 @@ def _unusual_lineages(layout: Layout) -> tuple[tuple[str, str], ...]:
 def _of_kind(kind: str) -> Callable[[Tables], sa.Select[Any]]:
     def view(tables: Tables) -> sa.Select[Any]:
         nodes = tables["task_tree_node"]
-        parameters = sa.func.coalesce(nodes.c.parameters, "{}").label("parameters")
-        columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes), parameters
+        columns = (
+            nodes.c.id,
+            nodes.c.process_metadata_id,
+            nodes.c.dtype,
+            *_course(nodes),
+            derived_views.parameters_of(nodes).label("parameters"),
+        )
         return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
 
     return view

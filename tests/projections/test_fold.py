@@ -37,7 +37,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.columns import COLUMNS
 from pycrorm_async.projections.fold import fold
-from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows, json_text
+from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
 from tests.projections.event_script import (
     NAVIGATE,
     PICK_UP,
@@ -136,11 +136,11 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
         "task_tree_node": [
             (
                 row(2), 1, None, "root", None, "RUNNING", time_us(2), 2_000_000_005, None, None,
-                None, None, None, None, None, None, None, None, None, False, None,
+                None, None, None, None, None, None, None, None, None, False,
             ),
             (
                 row(3), 1, row(2), "action", "NavigateAction", "RUNNING", time_us(3), 3_000_000_005, None, None,
-                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True, json_text(parameters),
+                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True,
             ),
         ],
     }  # fmt: skip
@@ -157,7 +157,6 @@ def test_a_node_that_ends_in_the_batch_in_which_it_started_is_one_insert() -> No
         [
             row(1), 1, None, "action", "SayingAction", "FAILED", time_us(1), 1_000_000_005, 2_000_000_005,
             2, "IKError", "no way", '["left",1]', '{"said":[1,null]}', None, None, None, None, None, False,
-            '{"text":"hi"}',
         ]
     ]  # fmt: skip
 
