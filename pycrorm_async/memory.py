@@ -166,7 +166,7 @@ class MemoryStatus(NamedTuple):
         writer: the state of the writer thread; None with a daemon.
         unadopted: by folder of a dead recorder that could not be recovered, the error.
         spool_fault: the fault of the queue's files that ended the recording (a failed sync, or deleted or replaced
-            files); None without one.
+            files); None if there is none.
         spool_lost: the positions of the records that deleted or replaced files took before they were stored, one line.
         declarations_unrepeated: the number of declarations that one segment contains and the later ones had no space
             to repeat: if the log goes back, their episodes can be healed only while that segment is kept.

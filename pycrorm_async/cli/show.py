@@ -296,7 +296,7 @@ def print_tree(nodes: Sequence[named_queries.NodeSummary], *, events: bool = Fal
 def tree_of(
     nodes: Iterable[named_queries.NodeSummary], *, events: bool = False, full: bool = False, no_wrap: bool = False
 ) -> Tree | None:
-    """Return the tree that `print_tree` prints; None without nodes. With `no_wrap` each node takes one line."""
+    """Return the tree that `print_tree` prints; None if there are no nodes. With `no_wrap` each node takes one line."""
     drawn: dict[int, Tree] = {}
     root: Tree | None = None
     for node in nodes:

@@ -49,7 +49,7 @@ class KeptSegments:
     Attributes:
         segments: number of segments.
         bytes: their size.
-        since: events stored after this moment can be stored again from the segments; None without segments.
+        since: events stored after this moment can be stored again from the segments; None if there are no segments.
     """
 
     segments: int

@@ -74,7 +74,7 @@ class ObjectValue(_Value, frozen=True):
 
 
 class RobotValue(_Value, frozen=True):
-    """The robot that acted at the start of a node: base pose, torso joint position in metres (None without a torso).
+    """The robot that acted at the start of a node: base pose, torso joint position in metres (None without torso).
 
     `name` is that of its object in the world; None in events of older versions.
     """
@@ -197,7 +197,7 @@ class SeenValue(_Value, frozen=True):
 
     Attributes:
         object: the object of the recorded world that it matches; None if none does.
-        visible: the visible share of the object, 0 to 1; None without a camera.
+        visible: the visible share of the object, 0 to 1; None if there is no camera.
         source: of the percept; None if it is that of its `ObjectDetected`.
     """
 
@@ -450,7 +450,7 @@ class NodeStarted(Happening, frozen=True):
         parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
             poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
             `MissingValue` for a value that cannot be recorded and for a field that the declaration omits.
-        robot: the robot's state at this moment; None without a robot.
+        robot: the robot's state at this moment; None if there is no robot.
         simulated: whether the node is part of a simulation; the same for all nodes of an episode.
         continues: in a follow-up episode, the sequence that the continued node had in the former episode.
     """

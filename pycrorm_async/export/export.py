@@ -82,7 +82,7 @@ class Exported(NamedTuple):
         unreadable: of LeRobot, by number, the reasons why episodes are not in the export: they are damaged, or of a
             newer version.
         unknown_name: a line about an argument of a question without rows, such as an object, that is nowhere in the
-            memory; empty without one.
+            memory; empty if there is none.
     """
 
     path: Path

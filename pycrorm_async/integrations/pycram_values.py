@@ -269,12 +269,12 @@ class PyCRAMValues:
         }
 
     def robot_key(self) -> Hashable | None:
-        """Return the key of PyCRAM's robot; None without one."""
+        """Return the key of PyCRAM's robot; None if there is none."""
         robot = self.pycram.World.robot
         return self.key(robot) if robot is not None else None
 
     def robot(self, episode: RecordedEpisode) -> RobotValue | None:
-        """Return the state of PyCRAM's robot, which acts also in the prospection world; None without one."""
+        """Return the state of PyCRAM's robot, which acts also in the prospection world; None if there is none."""
         robot, description = self.pycram.World.robot, self.pycram.RobotDescription.current_robot_description
         if robot is None:
             return None
@@ -419,7 +419,7 @@ class PyCRAMEpisodes:
         return self._simulation if world.is_prospection_world else self.real
 
     def cause(self, episode: RecordedEpisode) -> Hashable | None:
-        """Return the key of the innermost node of this thread in an episode; None without one."""
+        """Return the key of the innermost node of this thread in an episode; None if there is none."""
         for each in reversed(self.thread.nodes):  # a generator would take twice as long
             if each.key is not None and each.episode is episode:
                 return each.key

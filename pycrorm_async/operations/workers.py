@@ -98,7 +98,7 @@ class FoldWorkerState(msgspec.Struct, frozen=True):
         number: from 1.
         state: `idle`: not needed yet.
         since_wall_ns: the start of the state.
-        pid: of the process; None without one.
+        pid: of the process; None if there is none.
         restarts: the number of restarts.
         restart_wall_ns: the time of the next restart; None unless the state is `restarting`.
         reason: of the last death.

@@ -109,7 +109,7 @@ class EpisodeRobot(RowOfEvent, Base):
 
     Attributes:
         id: of its first row in `object`.
-        model: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        model: of its `RobotDescription`; None if there is none, and in episodes of version 0.1.0.
         serial: the serial number in it, if it has one.
         description_fingerprint: of its `ObjectDescription`; None in episodes of version 0.1.0.
     """

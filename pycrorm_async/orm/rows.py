@@ -400,7 +400,7 @@ class Designator(orm_base.RowOfEvent, orm_base.Base):
     Attributes:
         dtype: the type's name, such as `PickUpAction`, also if no class exists for it.
         kind: action, motion or language.
-        robot_state: at the moment it started; None without a robot.
+        robot_state: at the moment it started; None if there is no robot.
         items: the entries of its list and dict fields.
         parameters: its fields as recorded. Deferred: load them with `undefer(Action.parameters)` or
             `await action.awaitable_attrs.parameters`.
@@ -408,7 +408,7 @@ class Designator(orm_base.RowOfEvent, orm_base.Base):
         start_time: when its node started.
         end_time: when its node ended; None while it runs, and if it is LOST.
         reason: why its node failed.
-        robot: the name of the robot that acted; None without one. A type with a field `robot` has the field instead.
+        robot: the name of the robot that acted; None if there is none. A field `robot` of the type replaces it.
         duration_s: of its node by the robot's monotonic clock, in s; None while it runs, and if it is LOST. `duration`
             is its former name.
         sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode.
@@ -627,7 +627,7 @@ class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
         reason: why it failed: the class of an exception, or a text without its numbers and names; `failure_message`
             and `failure_arguments` belong to it.
         result: the return value of perform, as JSON.
-        robot: the name of the robot that acted; None without one.
+        robot: the name of the robot that acted; None if there is none.
         simulated: whether it belongs to a simulation, performed in a copy of the world.
         outcome: how the plan went on after it failed, as `RootFailure.outcome`; None for a node that did not fail.
             Loaded on request.
@@ -749,8 +749,8 @@ class LocationResolution(orm_base.RowOfEvent, orm_base.Base):
         node: the node that made the request.
         refusals: the first 1,000 places that it refused. Not loaded by default: use
             `await resolution.awaitable_attrs.refusals`.
-        occupied_cells: the places in its costmaps that are too near an obstacle. None without costmaps and in older
-            episodes, also of the next two.
+        occupied_cells: the places in its costmaps that are too near an obstacle. None if there are no costmaps and
+            in older episodes, also of the next two.
         hidden_cells: the places from which the target is not visible.
         free_cells: the places it chose from.
     """
@@ -797,7 +797,7 @@ class Detection(orm_base.RowOfEvent, orm_base.Base):
         source: `camera`, or `world_state` where the world's own state was read; the sensor or method instead, if the
             robot's perception named one.
         looked_for: the requested type; None for any.
-        visible: the visible share of the object, 0 to 1; None without a camera.
+        visible: the visible share of the object, 0 to 1; None if there is no camera.
         confidence: the confidence that the robot's perception computed; None if it computed none.
         object: the row of the object of the world at that moment; None for a hypothesis or a false positive, which
             matches none.

@@ -432,7 +432,7 @@ def _coroutines_of_tasks() -> set[int]:
 
 
 called_performs: ConnectedVar[CalledPerforms] = ConnectedVar("called_performs")
-"""The calls of the context's episode, or of its memory outside an episode; None without a memory."""
+"""The calls of the context's episode, or of its memory outside an episode; None if there is no memory."""
 
 
 # === execution context ========================================================================================

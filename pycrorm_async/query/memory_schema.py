@@ -62,7 +62,7 @@ class View:
     """A view of a memory.
 
     Attributes:
-        mapped: name of the mapped class; None without one.
+        mapped: name of the mapped class; None if there is none.
     """
 
     name: str

@@ -65,7 +65,7 @@ class EpisodeSummary(NotebookValue):
         clock_synchronized, clock_error_us: whether a time service kept the clock, and its estimated error.
         robots: the robots that took part, in the order in which they were added.
         digest_sequence, digest: the last digest that the log keeps of this episode, and the event up to which it covers
-            the episode; None without one.
+            the episode; None if there is none.
         tags: in alphabetical order.
         metadata: given by the program that opened it.
     """

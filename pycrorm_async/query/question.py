@@ -117,7 +117,7 @@ class Question(NotebookValue):
         return rows, "" if rows else await self.unknown_name()
 
     async def unknown_name(self) -> str:
-        """Return a line about an argument, such as an object, that is nowhere in the memory; empty without one.
+        """Return a line about an argument, such as an object, that is nowhere in the memory; empty if there is none.
 
         A question about one episode is compared with the names of that episode, so that it reads no others.
         """

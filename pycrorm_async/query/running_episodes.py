@@ -30,7 +30,7 @@ class RobotSummary:
 
     Attributes:
         name: of its object in the world.
-        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        model, serial: of its `RobotDescription`; None if there is none, and in episodes of version 0.1.0.
         description: fingerprint of its recorded description; None likewise.
     """
 

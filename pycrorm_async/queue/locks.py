@@ -110,7 +110,7 @@ class FileIdentity(NamedTuple):
 
 
 def read_note(path: Path) -> bytes | None:
-    """Read the last note of this lock's holder; None without a note or a file. Raises other `OSError`.
+    """Read the last note of this lock's holder; None if there is no note or no file. Raises other `OSError`.
 
     Retries a few times, because the holder may be writing: the checksum shows whether the note is complete.
     """

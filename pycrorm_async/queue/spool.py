@@ -109,7 +109,7 @@ class Spool:
             return locks.is_locked(self.path / WRITER)
 
     def writer_note(self) -> bytes | None:
-        """Read the note of the daemon that drains this spool now; None without one. Raises `SpoolUnavailable`."""
+        """Read the note of the daemon that drains this spool now; None if there is none. Raises `SpoolUnavailable`."""
         with wrap_os_errors(self.path):
             return locks.read_note(self.path / WRITER) if locks.is_locked(self.path / WRITER) else None
 

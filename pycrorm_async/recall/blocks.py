@@ -431,7 +431,7 @@ class CaseLibrary:
         return float(f"{math.sqrt(squares / size):.1e}")
 
     def range_of(self, type: str | None, feature: str) -> tuple[float, float] | None:  # noqa: A002
-        """Return the least and the greatest number of a feature among the cases of a type; None without any."""
+        """Return the least and the greatest number of a feature among the cases of a type; None if there are none."""
         parts = self._summaries(type, feature)
         return (min(each.least for each in parts), max(each.greatest for each in parts)) if parts else None
 

@@ -140,7 +140,7 @@ class Column:
 
     @cached_property
     def summary(self) -> Summary | None:
-        """The summary of the numbers; None without any."""
+        """The summary of the numbers; None if there are none."""
         numbers = self.values[self.present()].astype(np.float64)
         if not numbers.size:
             return None
@@ -227,7 +227,7 @@ class Case(NamedTuple):
         symbols: texts by feature; a tuple for a feature with several values at once, as the types of nearby objects.
         numbers: finite numbers by feature, in m, rad and s. A feature whose name ends in `yaw` is an angle.
         status: name of the `TaskStatus` with which it ended.
-        reason: class of the failure; None without one.
+        reason: class of the failure; None if there is none.
         duration_s: None for an action that is LOST.
         parent: id of the node of the nearest action around it; None outside any.
         simulated: whether it belongs to a simulation.

@@ -660,7 +660,7 @@ class OpenEpisodes:
         return tuple(map(episode_text, self._recent.copy()))
 
     def last_opened(self) -> EpisodeWriter | None:
-        """Return the open episode that was opened last in any context, without simulations; None without one."""
+        """Return the open episode that was opened last in any context, without simulations; None if there is none."""
         return next((each for each in reversed(self.all) if not each.simulated and not each.closed), None)
 
     def close(self, episode: EpisodeWriter, failure: BaseException | None) -> None:

@@ -299,7 +299,7 @@ class Activations(EpisodeBlock, Generic[B]):
 
 
 def _raised_by(error: BaseException | None, behaviour_class: type[B] | None) -> B | None:
-    """Return the innermost behaviour whose method the error left; None without one."""
+    """Return the innermost behaviour whose method the error left; None if there is none."""
     raised_by = None
     if error is not None and behaviour_class is not None:
         for frame, _line in traceback.walk_tb(error.__traceback__):

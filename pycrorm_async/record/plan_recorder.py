@@ -103,7 +103,7 @@ class Episode(EpisodeWriter):
 
     Attributes:
         task: the asyncio task that opened the episode; None outside any task.
-        world: the recorder of its world; None without a world.
+        world: the recorder of its world; None if there is no world.
         faults: faults of the plan, each type once: performs that were never awaited.
         calls: performs called in the episode's context.
     """
@@ -139,7 +139,7 @@ class Episode(EpisodeWriter):
             self.world = None
 
     def reference(self, world_object: Object, /) -> ObjectReference | None:
-        """Return the object's current row in this episode; None without a row."""
+        """Return the object's current row in this episode; None if there is no row."""
         return self.world.reference(world_object) if self.world is not None else None
 
     def node_reference(self, node: TaskTreeNode | None) -> NodeReference:
@@ -170,7 +170,7 @@ class Episode(EpisodeWriter):
         return self._root
 
     def sequence_of(self, node: TaskTreeNode | None) -> int | None:
-        """Return the sequence of this node or of its nearest recorded ancestor; None without one."""
+        """Return the sequence of this node or of its nearest recorded ancestor; None if there is none."""
         sequence = self.node_or_root(node)
         return sequence if sequence != self._root else None
 
@@ -448,7 +448,7 @@ class Recorder:
 
 
 def observing() -> Recorder | None:
-    """Return the recorder of the memory that records this context; None without an open memory."""
+    """Return the recorder of the memory that records this context; None if there is no open memory."""
     observer = plan_observer.get()
     return observer if isinstance(observer, Recorder) else None
 
@@ -626,7 +626,7 @@ class WorldRecorder(ObjectRows[Object]):
         return row
 
     def robot(self) -> RobotValue | None:
-        """Return base pose and torso height of the robot that acts in this context; None without a robot."""
+        """Return base pose and torso height of the robot that acts in this context; None if there is no robot."""
         robot = acting_robot(self.world)
         if robot is None:
             return None
