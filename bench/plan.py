@@ -61,6 +61,7 @@ async def turn(url: str | None, seed: int, *, writer: Writer = "thread") -> Dura
         if url is not None:
             memory = await stack.enter_async_context(Memory.open(url, writer=writer))
             await stack.enter_async_context(memory.episode(description="bench"))
+            await memory.flush()  # from now on the writer is ready
         world = stack.enter_context(BulletWorld())
         Object("pr2", ObjectType.ROBOT)
         milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))

@@ -53,6 +53,7 @@ from pycrorm_async.events.ids import episode_id
 from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
+from pycrorm_async.operations.writer_process import WriterAssignment, WriterProcess, WriterProcessState
 from pycrorm_async.plan.execution import called_performs, recorder
 from pycrorm_async.plan.task import TaskTreeNode, experience
 from pycrorm_async.projections.custom import Projection, validate_projections
@@ -106,6 +107,7 @@ class Parts(NamedTuple):
     recorder: Recorder
     recording: Recording
     experience: PickUpExperience
+    process: WriterProcess | None = None
 
     async def flush(self) -> None:
         """Wait until all events recorded so far are stored and visible. Raises as `Memory.flush` does."""
@@ -161,9 +163,10 @@ class MemoryStatus(NamedTuple):
         unawaited: one sentence for each designator type whose perform was called but never awaited.
         missing: the number of values that could not be recorded, and the reason of the last.
         samples_left_out: the number of samples dropped for lack of space.
-        folded: position up to which records are visible, as reported by the daemon; None with a writer thread.
-        drained: whether a process drains the queue now.
-        writer: the state of the writer thread; None with a daemon.
+        folded: position up to which records are visible, as reported by the daemon or the writer process; None with a
+            writer thread.
+        drained: whether a process drains the queue now, or the writer process is running.
+        writer: the state of the writer thread; None with a daemon and with a process.
         unadopted: by folder of a dead recorder that could not be recovered, the error.
         spool_fault: the fault of the queue's files that ended the recording (a failed sync, or deleted or replaced
             files); None if there is none.
@@ -172,6 +175,7 @@ class MemoryStatus(NamedTuple):
             to repeat: if the log goes back, their episodes can be healed only while that segment is kept.
         unrecorded: the number of nodes, episodes and other reports that came after the memory was closed, or in a
             forked child.
+        writer_process: the state of the memory's own writer process; None without one.
     """
 
     written: int
@@ -190,6 +194,7 @@ class MemoryStatus(NamedTuple):
     spool_lost: tuple[str, ...]
     declarations_unrepeated: int
     unrecorded: int = 0
+    writer_process: WriterProcessState | None = None
 
     def __repr__(self) -> str:
         """Leave out the fields that report nothing, so that a fault is seen."""
@@ -206,7 +211,7 @@ class MemoryStatus(NamedTuple):
             stored=queue.stored,
             bytes_spooled=queue.bytes_spooled,
             folded=None if drain_status is None else drain_status.folded,
-            drained=queue.is_drained,
+            drained=queue.is_drained if isinstance(parts.writer, WriterThread) else parts.writer.is_drained,
             faults=emitter.faults,
             unawaited=emitter.unawaited,
             missing=emitter.missing.count,
@@ -217,6 +222,7 @@ class MemoryStatus(NamedTuple):
             spool_lost=queue.lost,
             declarations_unrepeated=queue.declarations_unrepeated,
             unrecorded=emitter.unrecorded,
+            writer_process=None if parts.process is None else parts.process.state,
         )
 
 
@@ -303,27 +309,33 @@ class Memory:
             views: named queries to create beside the tables.
             projections: custom projections to fold besides the installed ones. An event that one cannot fold parks the
                 episode in that projection only: `flush` does not raise, `pycrorm status` shows the reason.
-            writer: `thread` for a thread of this process that moves events to the database, or `daemon` for a
-                `pycrorm writer` with the same URL and spool; by default as in the settings. With a daemon this process
-                has no connection for writing, the database may not exist yet, and `session()`, `dataframe()` and
-                `reading` open their own connection at the first query.
+            writer: `thread` for a thread of this process that moves events to the database, `process` for a process
+                that the memory starts and ends, or `daemon` for a `pycrorm writer` with the same URL and spool; by
+                default as in the settings. With a daemon this process has no connection for writing, the database may
+                not exist yet, and `session()`, `dataframe()` and `reading` open their own connection at the first
+                query.
             settings, clock: limits and intervals; the time source.
             plan_source: recorded with each episode; `pycrorm run` passes hash and commit of the plan's file.
 
         Raises:
-            UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
+            UnknownUrl: at once. `CallerError`: at once, for a private database, or views or projections of this
+                process, with a daemon or a process.
                 On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`, `SpoolForeign`.
         """
         address, settings = DatabaseAddress.parse(url), settings or Settings()
         keep_s = 0.0 if address.is_private else settings.keep_stored_s  # sqlite:// is never restored
         settings = replace(settings, writer=writer or settings.writer, keep_stored_s=keep_s)
-        if settings.writer == "daemon" and address.is_private:
-            raise CallerError("sqlite:// is private to this process, so no daemon can write it: use writer='thread'")
-        if settings.writer == "daemon" and (views or projections):
-            unused = "views" if views else "projections"
-            raise CallerError(
-                f"the daemon creates the tables, without the {unused} of this process: use writer='thread'"
-            )
+        if settings.writer != "thread":
+            other = "daemon" if settings.writer == "daemon" else "other process"
+            if address.is_private:
+                raise CallerError(
+                    f"sqlite:// is private to this process, so no {other} can write it: use writer='thread'"
+                )
+            if views or projections:
+                unused = "views" if views else "projections"
+                raise CallerError(
+                    f"the {other} creates the tables, without the {unused} of this process: use writer='thread'"
+                )
         return cls(
             address,
             spool=Path(spool) if spool is not None else None,
@@ -656,7 +668,7 @@ class Memory:
 
     async def _open(self) -> Parts:
         address = self._located = self._stack.enter_context(self._address.located())
-        by_daemon, declared = self._settings.writer == "daemon", []
+        by_daemon, by_thread, declared = self._settings.writer == "daemon", self._settings.writer == "thread", []
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
             # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
@@ -675,12 +687,19 @@ class Memory:
             spool.bind(log.log_id)
         recorder_id = episode_id(self._clock.wall_ns(), os.urandom(10))
         queue = RecorderQueue.create(
-            spool.path, settings=self._settings, clock=self._clock, recorder=recorder_id, offered=by_daemon
+            spool.path, settings=self._settings, clock=self._clock, recorder=recorder_id, offered=not by_thread
         )
         self._stack.callback(queue.release)
         writer: WriterThread | DelegatedWriter
-        if by_daemon:
-            writer = DelegatedWriter(queue, self._settings)
+        process = None
+        if not by_thread:
+            if not by_daemon:
+                async with open_destination(address, spool, clock=self._clock, settings=self._settings):
+                    pass  # makes the tables of a new database, so that it can be queried before the process is ready
+                where = WriterAssignment(address, spool.path.absolute(), queue.name, self._settings)
+                process = WriterProcess(where)
+                process.start()
+            writer = DelegatedWriter(queue, self._settings, process)
         else:
             open_ = partial(open_destination, address, spool, clock=self._clock, settings=self._settings)
             writer = WriterThread(
@@ -710,6 +729,7 @@ class Memory:
             Recorder(recording),
             recording,
             PickUpExperience(reading, lambda: self.recall.reader),
+            process,
         )
 
     async def __aexit__(

@@ -17,7 +17,7 @@ from pycrorm_async.errors import CallerError
 OnFull = Literal["wait", "fail"]
 RecordMeshes = Literal["boxes", "files"]
 OnUnrecordable = Literal["record_missing", "refuse"]
-Writer = Literal["thread", "daemon"]
+Writer = Literal["thread", "process", "daemon"]
 FileAccess = Literal["owner", "group"]
 Fold = Literal["idle", "at_end"]
 FILE_MODES: Final[Mapping[FileAccess, int]] = {"owner": 0o600, "group": 0o660}
@@ -44,7 +44,8 @@ class Settings:
     """Limits and intervals of one memory.
 
     Attributes:
-        writer: a thread of this process ("thread") or the daemon `pycrorm writer` ("daemon") drains the spool.
+        writer: a thread of this process ("thread"), a process that the memory starts and ends ("process"), or the
+            daemon `pycrorm writer` ("daemon") drains the recorder's folder.
         sync_interval_ms: written records wait at most this long for a sync to begin.
         segment_bytes: size of one file of the write-ahead queue, allocated before use.
         spool_bytes_max: one recorder holds at most this much on disk; beyond it `on_full` applies.

@@ -167,7 +167,8 @@ WriterOption = Annotated[
     typer.Option(
         "--writer",
         envvar="PYCRORM_WRITER",
-        help="The writer that moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
+        help="The writer that moves events to the database: a thread of this process, a process of its own, or the"
+        " daemon `pycrorm writer`.",
         show_envvar=True,
     ),
 ]

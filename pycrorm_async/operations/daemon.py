@@ -2,7 +2,7 @@
 
 Theory of operation. The actors are the daemon process, its fold workers (`operations.workers`), and the recorders,
 which are other processes with a folder each in the spool. One daemon drains a spool: it takes the spool's `writer` lock
-file, whose note also publishes the states of the fold workers to `pycrorm status`. `_Folders` finds the folders and
+file, whose note also publishes the states of the fold workers to `pycrorm status`. `Folders` finds the folders and
 claims each by its `drain` lock. The folder of a living recorder (`LiveSource`) is drained as far as it is synced, and
 released when the recorder ends; that of a dead one (`DeadSource`) is read to its end, completed with LOST ends, and
 deleted once everything in it is stored. A folder that cannot be claimed is reported and does not delay the others.
@@ -84,7 +84,7 @@ async def serve(
         )
         report(f"draining {place.path} into {address}")
         stored = StoredSegments(place.path, settings, wall_ns=SYSTEM_CLOCK.wall_ns)
-        folders = _Folders(place, destination.log_id, address, stored)
+        folders = Folders(place, destination.log_id, address, stored)
         assignment = Assignment(url, destination.log_id, projections, recall=settings.recall)
         workers = await stack.enter_async_context(
             FoldWorkers(fold_workers, assignment, settings=settings, report=report, note=note, forked=forked)
@@ -110,12 +110,22 @@ class _Note:
             self._failed = True
 
 
-class _Folders:
-    """Scans a spool and claims the folders that can be drained. Implements the writer's `SourceScanner`."""
+class Folders:
+    """Scans a spool and claims the folders that can be drained. Implements the writer's `SourceScanner`.
+
+    With `recorder`, the name of one, it leaves the folders of other living recorders.
+    """
 
     def __init__(
-        self, spool: Spool, log_id: str, address: DatabaseAddress, stored: StoredSegments | None = None
+        self,
+        spool: Spool,
+        log_id: str,
+        address: DatabaseAddress,
+        stored: StoredSegments | None = None,
+        *,
+        recorder: str | None = None,
     ) -> None:
+        self._recorder = recorder
         self._spool = spool
         self._stored = stored
         self._log_id = log_id
@@ -132,7 +142,7 @@ class _Folders:
         failed: dict[str, Exception] = {}
         present = self._spool.recorders()
         self._taken &= {each.name for each in present}
-        folders = [each for each in present if each.name not in but]
+        folders = [each for each in present if each.name not in but and self._is_ours(each)]
         if folders:  # a spool that contains a folder cannot be bound to another log any more
             self._spool.bind(self._log_id)
         for folder in folders:
@@ -145,6 +155,9 @@ class _Folders:
                     claimed.append(source)
                     self._taken.add(folder.name)
         return ScanResult(claimed, failed)
+
+    def _is_ours(self, folder: RecorderFolder) -> bool:
+        return self._recorder in (None, folder.name) or not folder.alive
 
     def _claim(self, folder: RecorderFolder) -> ClaimedSource | None:
         """Claim a folder as that of a living or a dead recorder; None if another process has it."""

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from pycrorm_async import errors
 from pycrorm_async.settings import Settings
@@ -231,7 +231,8 @@ class BackgroundWriter:
 
 # === delegated writer =========================================================================================
 #
-# Wait for the daemon that drains a memory's queue: flush and close without writing.
+# Wait for the daemon, or the memory's own writer process, that drains a memory's queue: flush and close without
+# writing.
 
 _POLL_S = 0.01
 """Interval at which the drain status is read."""
@@ -240,10 +241,32 @@ _UNDRAINED_S = 2.0
 Longer than a daemon takes to find a new queue."""
 
 
-class DelegatedWriter:
-    """The counterpart of `WriterThread` for a queue that a daemon drains. Belongs to the plan's loop."""
+class PrivateProcess(Protocol):
+    """A process that drains one queue and that its owner starts and ends."""
 
-    def __init__(self, queue: OfferedQueue, settings: Settings) -> None:
+    @property
+    def is_running(self) -> bool:
+        """True from the start of the process to its end, also while it does not drain yet."""
+        ...
+
+    @property
+    def reason(self) -> str | None:
+        """The reason why the process ended the last time; None if it never did."""
+        ...
+
+    async def end(self, *, at_once: bool) -> None:
+        """End the process and wait until it has ended; kill it if `at_once`."""
+        ...
+
+
+class DelegatedWriter:
+    """The counterpart of `WriterThread` for a queue that a daemon drains, or a process of its own if there is one.
+
+    Belongs to the plan's loop.
+    """
+
+    def __init__(self, queue: OfferedQueue, settings: Settings, process: PrivateProcess | None = None) -> None:
+        self.process = process
         self._queue = queue
         self._settings = settings
         self._drained_s = asyncio.get_running_loop().time()
@@ -262,17 +285,22 @@ class DelegatedWriter:
         self._raise_stopped()
 
     async def close(self) -> None:
-        """Wait until the queue, which the caller closed, is stored and visible in the tables.
+        """Wait until the queue, which the caller closed, is stored and visible in the tables; then end its process.
 
         Stops waiting, with a warning, when no process drains the queue, when the database is unavailable, and after
         `flush_timeout_s` without progress: the next drainer of the spool stores the rest. Raises `EpisodeParked`,
         `TablesPending`.
         """
-        await self._queue.synced_to()
-        position = self._queue.written
-        hindrance = await self._wait(position, undrained_s_max=_UNDRAINED_S)
-        if hindrance is not None:
-            _log.warning("%s (%s)", self._describe_rest(position), hindrance)
+        hindrance: str | None = "closing was interrupted"
+        try:
+            await self._queue.synced_to()
+            position = self._queue.written
+            hindrance = await self._wait(position, undrained_s_max=_UNDRAINED_S)
+            if hindrance is not None:
+                _log.warning("%s (%s)", self._describe_rest(position), hindrance)
+        finally:
+            if self.process is not None:
+                await self.process.end(at_once=hindrance is not None)
         self._raise_stopped()
 
     async def _wait(
@@ -293,12 +321,17 @@ class DelegatedWriter:
         while self._status.folded < position and not self._is_pending(position):
             on_poll()
             now_s = loop.time()
-            if self._status.note.unavailable is None and self._queue.is_drained:
+            if self._status.note.unavailable is None and self.is_drained:
                 self._drained_s = now_s
             if now_s - self._drained_s > undrained_s_max:
                 return False
             await asyncio.sleep(_POLL_S)
         return True
+
+    @property
+    def is_drained(self) -> bool:
+        """True if a process drains the queue, or this memory's own process is running."""
+        return self._queue.is_drained or (self.process is not None and self.process.is_running)
 
     @property
     def _status(self) -> ExternalDrain:
@@ -331,11 +364,14 @@ class DelegatedWriter:
         status = self._status
         if status.note.failure is not None:
             return f"no more events are stored: {status.note.failure}"
-        if not self._queue.is_drained:
+        if not self.is_drained:
+            if self.process is not None:
+                return f"the writer process {self.process.reason or 'has not started yet'}"
             return "no process drains this spool: start `pycrorm writer`"
+        drainer = "daemon" if self.process is None else "writer process"
         if status.note.unavailable is not None:
-            return f"the daemon reports that the database is unavailable: {status.note.unavailable}"
-        return "the daemon makes no progress" if status.stored == before else TOO_MANY_EVENTS
+            return f"the {drainer} reports that the database is unavailable: {status.note.unavailable}"
+        return f"the {drainer} makes no progress" if status.stored == before else TOO_MANY_EVENTS
 
     def _raise_stopped(self) -> None:
         stopped = dict(self._status.note.stopped)

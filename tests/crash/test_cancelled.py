@@ -21,7 +21,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.operations.daemon import _Folders
+from pycrorm_async.operations.daemon import Folders
 from pycrorm_async.operations.destination import LogAndTables, open_destination
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
@@ -253,7 +253,7 @@ async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(
                 if "has ended" in line:
                     leave.set()
 
-            look = _Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
+            look = Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
 
             def scan_and_note(but: Collection[str]) -> ScanResult:
                 result = look(but)

@@ -12,7 +12,7 @@ from pycrorm_async import Memory, recover
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.codec import Heading, encode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, ObjectAdded, PoseValue
-from pycrorm_async.operations.daemon import _Folders
+from pycrorm_async.operations.daemon import Folders
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance import repair_folder
 from pycrorm_async.store.address import DatabaseAddress
@@ -100,7 +100,7 @@ async def test_a_new_plan_reports_damage_once_and_continues(
 def test_a_folder_with_damage_is_scanned_whole_before_any_of_it_is_supplied_again(
     tmp_path: Path, spool: Path, damaged: FolderWriter
 ) -> None:
-    look = _Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
+    look = Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
     first = look(())
     assert (len(first.held), first.failed) == (1, {})
     assert first.held[0].release() is None

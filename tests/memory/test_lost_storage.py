@@ -172,7 +172,7 @@ async def drained_by(writer: Writer, url: str, spool: Path) -> AsyncIterator[Non
 
 @pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("deleted", ["folder", "spool"])
-@pytest.mark.parametrize("writer", ["thread", "daemon"])
+@pytest.mark.parametrize("writer", ["thread", "daemon", "process"])
 async def test_the_plan_continues_and_the_next_memory_records_again(
     database_url: str, tmp_path: Path, writer: Writer, deleted: str, caplog: pytest.LogCaptureFixture
 ) -> None:
