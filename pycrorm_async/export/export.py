@@ -43,6 +43,7 @@ from pycrorm_async.export.selection import (
     select_rows,
     versions_of,
 )
+from pycrorm_async.export.traces import OTLP, TRACE
 from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.query.question import Question
@@ -56,10 +57,19 @@ if TYPE_CHECKING:
 
 
 FileFormat: TypeAlias = str
-"""The name of a format: `parquet`, `csv` or `jsonl` for rows, `lerobot`, `rrd` or `mcap` for episodes, or one of an
-installed package."""
+"""The name of a format: `parquet`, `csv` or `jsonl` for rows, `lerobot`, `rrd`, `mcap`, `trace` or `otlp` for episodes,
+or one of an installed package."""
 
-FORMATS: Final = {"parquet": PARQUET, "csv": CSV, "jsonl": JSONL, "lerobot": LEROBOT, "rrd": RERUN, "mcap": MCAP}
+FORMATS: Final = {
+    "parquet": PARQUET,
+    "csv": CSV,
+    "jsonl": JSONL,
+    "lerobot": LEROBOT,
+    "rrd": RERUN,
+    "mcap": MCAP,
+    "trace": TRACE,
+    "otlp": OTLP,
+}
 """The built-in formats by name."""
 
 _OPTIONS = {
@@ -158,9 +168,9 @@ async def export(
         what: an episode or several (a row for each node), by number, id or `last`; a view by name, or a mapped
             class, of all episodes that have ended; a question of `memory.ask` or its name; or a select.
         path: of the file.
-        file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; `rrd` or `mcap` for
-            one episode, which may be running; one that an installed package offers (`export.formats`); by default that
-            of the suffix.
+        file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder, and `otlp`; `rrd`,
+            `mcap` or `trace` for one episode, which may be running; one that an installed package offers
+            (`export.formats`); by default that of the suffix.
         episodes: limit a view, or a question about all, to these.
         arguments: of a question that is named.
         force: replace the file if it exists; a folder only if it is such a data set.

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,9 +141,19 @@ def _numbers(pose: event_types.PoseValue) -> tuple[float, ...]:
     return (*pose.position, *pose.orientation)
 
 
+E = TypeVar("E", bound=ExportedEpisode)
+
+
 async def read_episode(
     reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
 ) -> ExportedEpisode:
+    """Read an episode, as `read_episode_as` does."""
+    return await read_episode_as(ExportedEpisode, reading, covered, report_events)
+
+
+async def read_episode_as(
+    kind: type[E], reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
+) -> E:
     """Read an episode up to the event `covered.events`. `report_events` gets the number of events read so far.
 
     Raises `CallerError` for one without an event; `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
@@ -152,7 +162,7 @@ async def read_episode(
     [row] = await log.episodes(covered.number, covered.number)
     if covered.events == 0:
         raise CallerError(f"the log has no event of episode {covered.number}")
-    episode = ExportedEpisode(row, log.address)
+    episode = kind(row, log.address)
     episode.dtypes = await log.dtypes()
     async for page in log.pages(row._replace(head=covered.events)):
         for event in page:

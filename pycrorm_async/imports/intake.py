@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Protocol, Self, TypeAlias
@@ -22,16 +22,18 @@ from typing import Any, Final, Literal, NamedTuple, Protocol, Self, TypeAlias
 import msgspec
 
 from pycrorm_async.errors import CallerError, FilesError
-from pycrorm_async.events.types import NodeStatus, PoseValue
+from pycrorm_async.events.types import FieldDeclared, NodeStatus, PoseValue
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.record.declarations import FieldSpec
+from pycrorm_async.record.plan_types import built_in_declaration
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import json_text
 
 TYPES_MAX: Final = 200
 """Bounds the types of nodes that one import declares, because each has a table. Further names share one type."""
-FIELDS_MAX: Final = 40
-"""Bounds the fields of a type that an import declares; further parameters are JSON in the field `further`."""
+FIELDS_MAX: Final = 24
+"""Bounds the fields of a type that an import declares, so that a declaration has room for them and for those that a
+built-in type has; further parameters are JSON in the field `further`."""
 _IDENTITY_BYTES = 2**20
 """The bytes at both ends of a file that identify it, so that a large bag is not read twice."""
 
@@ -150,7 +152,7 @@ class Intake:
         self.recording = recording
         self._is_stored = is_stored
         self._report_progress = report_progress
-        self._types: dict[str, dict[str, FieldSpec]] = {}
+        self._types: dict[str, set[str]] = {}
 
     def episode(
         self,
@@ -208,7 +210,9 @@ class Intake:
         if dtype not in self._types and len(self._types) >= TYPES_MAX:
             self.left_out("types", f"a file has at most {TYPES_MAX} of its own; these nodes are of the type Step")
             dtype, parameters = "Step", {"name": dtype, **parameters}
-        declared = self._types.setdefault(dtype, {})
+        declared = self._types.setdefault(dtype, set())
+        built_in = built_in_declaration(dtype)
+        known = {each.name: each for each in built_in.fields} if built_in is not None else {}
         fields: dict[str, FieldSpec] = {}
         values: dict[str, Any] = {}
         further: dict[str, Any] = {}
@@ -218,8 +222,8 @@ class Intake:
             if name not in declared and len(declared) >= FIELDS_MAX:
                 further[name] = value
                 continue
-            spec, values[name] = _recorded(value)
-            fields[name] = declared[name] = spec
+            declared.add(name)
+            fields[name], values[name] = _recorded(value, known.get(name))
         if further:
             fields["further"], values["further"] = "text", json_text(further)
         return dtype, fields, values
@@ -296,7 +300,15 @@ class IntakeEpisode:
         return key in self._open
 
     def object_added(
-        self, key: Hashable, name: str, object_type: str, pose: PoseValue, at: int, *, urdf: str | None = None
+        self,
+        key: Hashable,
+        name: str,
+        object_type: str,
+        pose: PoseValue,
+        at: int,
+        *,
+        joints: Mapping[str, float] = {},
+        urdf: str | None = None,
     ) -> None:
         """Record that an object is in the world from now on."""
         self._last = max(self._last, at)
@@ -304,24 +316,19 @@ class IntakeEpisode:
             return
         self._report.objects += 1
         self._poses[key] = (*pose.position, *pose.orientation)
-        self._joints[key] = {}
+        self._joints[key] = dict(joints)
         if self._recorded is not None:
-            self._recorded.object_added(key, name, object_type, pose, urdf=urdf, at=at)
+            self._recorded.object_added(key, name, object_type, pose, joints, urdf=urdf, at=at)
 
     def has_object(self, key: Hashable) -> bool:
         """Return whether an object of this key was added."""
         return key in self._poses
 
-    def object_moved(
-        self, key: Hashable, pose: PoseValue, at: int, *, name: str = "", object_type: str = "UNKNOWN"
-    ) -> None:
-        """Record the pose of an object, unless it is the same as before; for a new key add it under this name."""
-        if key not in self._poses:
-            self.object_added(key, name or str(key), object_type, pose, at)
-            return
+    def object_moved(self, key: Hashable, pose: PoseValue, at: int) -> None:
+        """Record the pose of an object that was added, unless it is the same as before."""
         self._last = max(self._last, at)
         numbers = (*pose.position, *pose.orientation)
-        if self.is_stored or self._poses.get(key) == numbers:
+        if self.is_stored or self._poses.get(key, numbers) == numbers:
             return
         self._poses[key] = numbers
         self._report.changes += 1
@@ -385,9 +392,16 @@ class IntakeEpisode:
             self._recorded.close(status=self._status, at=self._last)
 
 
-def _recorded(value: Any) -> tuple[FieldSpec, Any]:
-    """Return the type of the field of a value from a file, and the value to record."""
+def _recorded(value: Any, known: FieldDeclared | None) -> tuple[FieldSpec, Any]:
+    """Return the type of the field of a value from a file, and the value to record.
+
+    `known` is the field of the built-in type, whose type is taken if the value fits.
+    """
     match value:
+        case str() if known is not None and known.type in ("enum", "text"):
+            return known.type, value
+        case int() if known is not None and known.type == "integer" and not isinstance(value, bool):
+            return "integer", value
         case bool():
             return "boolean", value
         case int() | float():
@@ -398,11 +412,23 @@ def _recorded(value: Any) -> tuple[FieldSpec, Any]:
             return "object", value.key
         case PoseValue():
             return "pose", value
-        case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation} if all(
-            isinstance(each, int | float) for each in (*position, *orientation)
+        case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation, **rest} if (
+            _item_type([*position, *orientation]) == "real"
         ):
-            return "pose", pose_at(position, orientation, 0)
+            return "pose", pose_at(position, orientation, 0, str(rest.get("frame", "map")))
+        case list() | tuple() if (item := _item_type(value)) is not None:
+            return ("list", item), list(value)
+        case dict() if (item := _item_type(value.values())) is not None:
+            return ("dict", item), value
     return "text", json_text(value)
+
+
+def _item_type(values: Iterable[Any]) -> Literal["real", "text"] | None:
+    """Return the type of the items of a list or dict; None if it is empty, or they are of several types."""
+    types = {type(each) for each in values}
+    if types and types <= {int, float}:
+        return "real"
+    return "text" if types == {str} else None
 
 
 def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map") -> PoseValue:

@@ -22,7 +22,7 @@ class Span:
 
     Attributes:
         key: names it in its episode.
-        start, end: in ns since 1970; without an end it ends UNKNOWN with its episode.
+        start, end: in ns since 1970; without an end it ends with its episode, or after the last of the other nodes.
         parent: the key of the node it is inside; the root takes the place of one that is not in the file.
         failure: reason and message.
         instants: observations of it: time, name, values.
@@ -64,13 +64,14 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[O
     steps: list[tuple[int, int, int, int, Any]] = [
         (each[0], OTHER, 0, index, each) for index, each in enumerate(others)
     ]
+    last = max((_end_of(each) for each in spans if each.end is not None), default=0)
     for index, span in enumerate(spans):
         begin, depth = places[span.key]
         steps.append((begin, START, depth, index, span))
         steps += [(max(each[0], begin), INSTANT, depth, index, (span, each)) for each in span.instants]
-        if span.end is not None:
-            phase = END if span.end > begin else EMPTY_END
-            steps.append((max(span.end, begin), phase, -depth, index, span))
+        end = last if span.end is None and span.status != "UNKNOWN" else span.end
+        if end is not None:
+            steps.append((max(end, begin), END if end > begin else EMPTY_END, -depth, index, span))
     for _at, phase, _depth, _index, what in sorted(steps, key=lambda each: each[:4]):
         if phase == OTHER:
             at, give = what
@@ -82,7 +83,7 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[O
             span, (at, name, values) = what
             episode.observe(name, values, at, node=span.key)
         else:
-            episode.end(what.key, what.status, what.end, failure=what.failure, result=what.result)
+            episode.end(what.key, what.status, what.end or last, failure=what.failure, result=what.result)
 
 
 def _places(spans: Sequence[Span]) -> dict[Hashable, tuple[int, int]]:

@@ -26,18 +26,17 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import msgspec
 
 from pycrorm_async.events.types import NodeStatus
+from pycrorm_async.export.traces import OWN
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
 from pycrorm_async.imports.spans import Span, give_spans, nest
 
-OWN: Final = "pycrorm"
-"""The key of what our own exports add to the formats, so that an import gives the same nodes again."""
-_OWN = "pycrorm."
+_OWN = f"{OWN}."
 _NAMES_MAX, _NAME_MAX = 100, 200
 """Bounds the names of processes and threads in the metadata of an episode, and their characters."""
 _DURATION_US_MAX = 2**53
@@ -295,7 +294,8 @@ class _EventReader:
         if isinstance(own, dict) and isinstance(own.get("node"), int):
             parameters = {key: each for key, each in arguments.items() if key != OWN}
             span = _own_span(own, name, parameters, start, end)
-            self._own.append(span)
+            if own.get("kind") != "root":  # the root of the episode takes its place
+                self._own.append(span)
             return span
         self._count += 1
         span = Span(-self._count, *_named(name, arguments, self._settings), start, end)
@@ -335,14 +335,22 @@ def _named(name: str, parameters: Mapping[str, Any], settings: TraceMap) -> tupl
     return dtype, parameters if dtype == name and name.isidentifier() else {"name": name, **parameters}
 
 
-def _own_span(own: Mapping[str, Any], dtype: str, parameters: Mapping[str, Any], start: int, end: int | None) -> Span:
-    """Return the node of an export of ours."""
+def _own_span(
+    own: Mapping[str, Any],
+    dtype: str,
+    parameters: Mapping[str, Any],
+    start: int,
+    end: int | None,
+    *,
+    has_objects: bool = True,
+) -> Span:
+    """Return the node of an export of ours; where the file has no objects, their names take their places."""
     kind, failure = own.get("kind"), own.get("failure")
     status: Any = own.get("status")
     return Span(
         own["node"],
         str(own.get("dtype") or dtype),
-        {name: _object_key(each) for name, each in parameters.items()},
+        {name: _object_of(each, has_objects=has_objects) for name, each in parameters.items()},
         start,
         end,
         parent=own.get("parent"),
@@ -353,26 +361,32 @@ def _own_span(own: Mapping[str, Any], dtype: str, parameters: Mapping[str, Any],
     )
 
 
-def _object_key(value: Any) -> Any:
-    """Return the key of an object for a reference to one in an export of ours."""
+def _object_of(value: Any, *, has_objects: bool) -> Any:
+    """Return the key of an object, or its name, for a reference to one in an export of ours."""
     match value:
-        case {"object": int() as key, "row": int()}:
-            return intakes.ObjectKey(key)
+        case {"object": int() as key, "row": int(), **rest}:
+            return intakes.ObjectKey(key) if has_objects else rest.get("name")
     return value
 
 
 def _change(own: Mapping[str, Any]) -> _Give:
-    """Return what gives a change of an object, of an export of ours, to an episode."""
-    key, pose = own.get("object"), own.get("pose")
+    """Return what gives an observation or a change of an object, of an export of ours, to an episode."""
+    if "observed" in own:
+        name, values, node = str(own["observed"]), own.get("values"), own.get("node")
+        return lambda episode, at: episode.observe(name, values, at, node=node)
+    key, pose, joints = own.get("object"), own.get("pose"), own.get("joints", {})
 
     def give(episode: IntakeEpisode, at: int) -> None:
-        if isinstance(pose, dict) and isinstance(key, int):
+        if isinstance(pose, dict):
             value = intakes.pose_at(pose["position"], pose["orientation"], at, str(pose.get("frame", "map")))
-            episode.object_moved(
-                key, value, at, name=str(own.get("name", key)), object_type=str(own.get("type", "UNKNOWN"))
-            )
-        elif isinstance(key, int):
+            if not episode.has_object(key):
+                episode.object_added(key, str(own.get("name")), str(own.get("type")), value, at, joints=joints)
+                return
+            episode.object_moved(key, value, at)
+        if own.get("removed"):
             episode.object_removed(key, at)
+        elif joints:
+            episode.joints_moved(key, joints, at)
 
     return give
 
@@ -436,7 +450,7 @@ class _Trace:
             return None
         if "kind" in own:
             own["failure"] = [own.get("reason"), own.get("message")] if "reason" in own else None
-            span = _own_span({**own, "node": key, "parent": parent}, name, attributes, start, end)
+            span = _own_span({**own, "node": key, "parent": parent}, name, attributes, start, end, has_objects=False)
         else:
             span = Span(key, *_named(name, attributes, settings), start, end, parent=parent)
             span.kind = settings.kinds.get(span.dtype, "action")
