@@ -53,6 +53,7 @@ from pycrorm_async.events.ids import episode_id
 from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
+from pycrorm_async.operations.stored_episodes import LogEpisodes
 from pycrorm_async.operations.writer_process import WriterAssignment, WriterProcess, WriterProcessState
 from pycrorm_async.plan.execution import called_performs, recorder
 from pycrorm_async.plan.task import TaskTreeNode, experience
@@ -720,7 +721,10 @@ class Memory:
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         episodes = OpenEpisodes(emitter, self._clock)
         known = KnownTypes(built_in_declaration)
-        recording = Recording(emitter, episodes, known, declared, software=__version__, provenance=provenance)
+        stored = LogEpisodes(address, spool, queue, self._unadopted, timeout_s=self._settings.flush_timeout_s)
+        recording = Recording(
+            emitter, episodes, known, declared, software=__version__, provenance=provenance, stored_episodes=stored
+        )
         return Parts(
             queue,
             writer,

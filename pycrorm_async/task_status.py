@@ -19,3 +19,5 @@ class TaskStatus(Enum):
     """Interrupted by a monitor."""
     LOST = "LOST"
     """No end was recorded: the process died, or the episode ended while the node was running. A plan never sees it."""
+    UNKNOWN = "UNKNOWN"
+    """It ended, and its executive did not report how: neither a success nor a failure. A plan never sees it."""

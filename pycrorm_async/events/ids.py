@@ -16,7 +16,7 @@ import uuid
 from typing import NamedTuple, NewType
 
 EpisodeId = NewType("EpisodeId", bytes)
-"""The 16 bytes of a UUIDv7."""
+"""The 16 bytes of a UUIDv7; of an episode with a name of its own, of a UUIDv5, or of any UUID that its caller gave."""
 EpisodeNumber = NewType("EpisodeNumber", int)
 Sequence = NewType("Sequence", int)
 """1, 2, 3 … inside an episode, without gaps."""
@@ -31,6 +31,9 @@ SEQUENCE_MAX = 2**26 - 1
 """Bounds the events of one episode: the 26 bits of a row id that hold the sequence."""
 SLOT_MAX = 2**5 - 1
 """Bounds the row ids of one event: the 5 bits of a row id that hold the slot."""
+
+_NAMES = uuid.UUID("7f0e6c1a-3b52-4a8e-9f0d-5d2f1c7a64b1")
+"""The namespace of the names of episodes, chosen at random."""
 
 SLOT_NODE = 0
 """Slot of the event's own row: a node and its designator, an object's state, an attachment."""
@@ -80,6 +83,22 @@ def episode_id(wall_ns: int, randomness: bytes) -> EpisodeId:
     value = value & ~(0xF << 76) | 0x7 << 76
     value = value & ~(0x3 << 62) | 0x2 << 62
     return EpisodeId(value.to_bytes(16))
+
+
+def named_episode_id(name: str | uuid.UUID) -> EpisodeId:
+    """Return the id of an episode with a name of its own: that of a UUID or its text is itself, of another a UUIDv5.
+
+    >>> episode_text(named_episode_id("kitchen 2019-05-01"))
+    '432178db-930b-5aac-b76f-4affd3efcf41'
+    """
+    if isinstance(name, uuid.UUID):
+        return EpisodeId(name.bytes)
+    return parse_episode_id(name) if is_episode_id(name) else EpisodeId(uuid.uuid5(_NAMES, name).bytes)
+
+
+def is_named(episode: bytes) -> bool:
+    """Return whether the episode has a name, by which a later recorder can continue it."""
+    return episode[6] >> 4 == 5
 
 
 def episode_text(episode: EpisodeId) -> str:

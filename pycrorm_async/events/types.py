@@ -22,9 +22,11 @@ import msgspec
 # The JSON omits each field that has its default value; most defaults are null or empty.
 
 NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
-NodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"]
+NodeStatus: TypeAlias = Literal[
+    "RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST", "UNKNOWN"
+]
 """The names of `TaskStatus`."""
-EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST"]
+EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST", "UNKNOWN"]
 LOSES_OPEN_NODES: Final[frozenset[EpisodeStatus]] = frozenset({"INTERRUPTED", "LOST"})
 """The statuses of an episode whose nodes without an end are LOST: Ctrl-C came inside a hook, or the process died."""
 
@@ -465,12 +467,21 @@ class NodeStarted(Happening, frozen=True):
 
 
 class NodeEnded(Happening, frozen=True):
-    """A node of the task tree ended. `result` is JSON, or a `MissingValue`."""
+    """A node of the task tree ended. `result` is JSON, or a `MissingValue`.
+
+    `untimed` is true if the time of the end is not known: that of the event says only when the end was reported.
+    """
 
     node: int
     status: NodeStatus
     failure: FailureValue | None = None
     result: Any = None
+    untimed: bool = False
+
+    @property
+    def has_time(self) -> bool:
+        """Whether the node ended at the time of the event; not if recovery computed the end."""
+        return self.status != "LOST" and not self.untimed
 
 
 class LocationResolved(Happening, frozen=True):

@@ -232,7 +232,7 @@ def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators,
     number, sequence, _, _, _, monotonic_ns, _ = event
     node, status = row_of(number, ended.node), ended.status
     outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
-    if status == "LOST":  # recovery computed this end; the true end time was never recorded
+    if not ended.has_time:
         rows.end_node(node, status, None, None, outcome)
     else:
         rows.end_node(node, status, monotonic_ns, sequence, outcome)

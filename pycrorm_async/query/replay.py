@@ -236,7 +236,7 @@ class EpisodeReplay:
         if (node := self.nodes.get(ended.node)) is None:
             raise CannotFold(f"node {ended.node} ends and never started")
         node.status, node.failure = ended.status, ended.failure
-        if ended.status != "LOST":
+        if ended.has_time:
             node.end = at
 
     def _answer(self, event: StoredEvent, answer: event_types.ObjectDetected | event_types.LocationResolved) -> None:

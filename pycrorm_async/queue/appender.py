@@ -168,13 +168,20 @@ class Appender:
 
     # --- putting -----------------------------------------------------------------------------------------------
 
-    def put(self, heading: Heading, payload: bytes, reserved: bool) -> int:  # noqa: FBT001  # the hot path
+    def put(
+        self,
+        heading: Heading,
+        payload: bytes,
+        reserved: bool,  # noqa: FBT001  # the hot path
+        at: tuple[int, int] | None = None,
+        after: int = 0,
+    ) -> int:
         """Append one event as `RecorderQueue.put_nowait` does."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
         body = encode_body(name, payload)
         body_checksum = crc32(body)
-        kind, owner, sequence = EVENT, episode or NO_EPISODE, 0
+        kind, owner, sequence, last = EVENT, episode or NO_EPISODE, 0, None
         gc_lock, thread = self._gc_lock, get_ident()
         if gc_lock.owner == thread:
             raise gc_lock.reentered()
@@ -192,18 +199,18 @@ class Appender:
                     sequence = last[0] + 1
                     if sequence > self._events_max and type_name not in _ENDS:
                         raise EpisodeFull(_FULL_EPISODE.format(episode_text(episode), sequence - 1))
-                elif type_name == EPISODE_STARTED:
-                    self._check_open_episodes()
-                    sequence = 1
                 else:
-                    raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+                    sequence = self._first_sequence(episode, type_name, after)
                 end = self._offset + HEADER_BYTES + len(body)
                 if end > (self._end if reserved else self._ordinary_end):
                     self._find_room(HEADER_BYTES + len(body), reserved=reserved)
                     end = self._offset + HEADER_BYTES + len(body)
                 offset = self._offset
                 position = self.position + 1
-                wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
+                if at is None:
+                    wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
+                else:
+                    wall_ns, monotonic_ns = at[0], at[1] if last is None else max(at[1], last[2])
                 header = encode_frame_header(
                     kind,
                     len(name),
@@ -241,6 +248,13 @@ class Appender:
                     gc_lock.paused = False
                     enable()
         return sequence
+
+    def _first_sequence(self, episode: EpisodeId, type_name: str, after: int) -> int:
+        """Return the sequence of the first event of an episode that is not open. Needs the lock."""
+        if type_name != EPISODE_STARTED and not after:
+            raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+        self._check_open_episodes()
+        return after + 1
 
     def _check_open_episodes(self) -> None:
         """Refuse an episode if the list of open episodes in a header would leave no space for the largest record."""

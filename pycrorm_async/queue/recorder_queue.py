@@ -136,7 +136,15 @@ class RecorderQueue:
 
     # --- producers ---------------------------------------------------------------------------------------------
 
-    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+    def put_nowait(
+        self,
+        heading: Heading,
+        payload: bytes,
+        *,
+        reserved: bool = False,
+        at: tuple[int, int] | None = None,
+        after: int = 0,
+    ) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
         May be called from any thread, but not from a signal handler, which could interrupt the holder of the lock. A
@@ -144,6 +152,9 @@ class RecorderQueue:
 
         Args:
             reserved: the event may use the reserve (`spool_reserve_bytes`), which other events leave free.
+            at: the wall time and the monotonic time of the event, ns; by default those of the clock. The monotonic
+                time is that of the episode's last event if it is earlier.
+            after: of the first event of a named episode that earlier recorders began: the last sequence they stored.
 
         Raises:
             SpoolFull: the event does not fit; `SpoolStuck` instead after `fail`.
@@ -153,7 +164,7 @@ class RecorderQueue:
             InternalError: an event before its `EpisodeStarted` or after its `EpisodeEnded`, or a record above
                 `record_bytes_max` that no segment can hold. The hooks put neither.
         """
-        return self._appender.put(heading, payload, reserved)
+        return self._appender.put(heading, payload, reserved, at, after)
 
     def put_blob(self, content: bytes) -> str:
         """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.

@@ -28,7 +28,7 @@ from typing import NamedTuple
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import EpisodeId, episode_text, is_named
 from pycrorm_async.events.types import references_in
 from pycrorm_async.queue.blobs import is_whole
 from pycrorm_async.queue.format import (
@@ -235,7 +235,7 @@ class SegmentScanner:
                         type_name = types[name] = check_type(path, offset, name)
                     if kind == EVENT:
                         before = opened.get(episode)
-                        if sequence != (before[0] if before else 0) + 1:
+                        if sequence != (before[0] if before else 0) + 1 and (before or not is_named(episode)):
                             raise _not_next(path, offset, episode, sequence, before)
                         opened[episode] = (sequence, wall_ns, monotonic_ns)
                         if name == _EPISODE_ENDED:

@@ -14,7 +14,7 @@ import msgspec
 
 from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.codec import LOST, Record
-from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.events.ids import EpisodeId, episode_text, is_named, parse_episode_id
 from pycrorm_async.queue import format as spool_format
 from pycrorm_async.queue import spool
 from pycrorm_async.queue.blobs import blob_files
@@ -180,9 +180,9 @@ def _last_of(record: Record | spool_format.Frame) -> spool_format.LastRecord:
 # that is damaged further on supplies its records before the damage and then raises `SpoolDamaged`. A repair of that
 # folder keeps the same records at its beginning, so draining again continues with the same positions and sequences.
 #
-# When the scan has finished, each open episode gets a computed end: an EpisodeEnded of status LOST behind the last
-# record, derived from the episode's last record and never written to the folder. A recovery that is killed and repeated
-# computes the same bytes, and the log stores them once.
+# When the scan has finished, each open episode without a name of its own gets a computed end: an EpisodeEnded of status
+# LOST behind the last record, derived from the episode's last record and never written to the folder. A recovery that
+# is killed and repeated computes the same bytes, and the log stores them once.
 #
 # `acknowledge` deletes segments whose records are all stored, oldest first, but keeps the last scanned one: the ends
 # are computed from its header and records, and the next segment's header, which lists the open episodes too, may be
@@ -383,7 +383,11 @@ class _Batch(NamedTuple):
 
 
 def computed_ends(prefix: ValidPrefix) -> tuple[Record, ...]:
-    """Compute an EpisodeEnded of status LOST for each open episode, positioned behind the last record."""
+    """Compute an EpisodeEnded of status LOST for each open episode, positioned behind the last record.
+
+    Named episodes get none: a later recorder can continue them.
+    """
+    open_ = sorted(each for each in prefix.open.items() if not is_named(each[0]))
     return tuple(
         Record(
             position=prefix.cut.position + 1 + index,
@@ -395,7 +399,7 @@ def computed_ends(prefix: ValidPrefix) -> tuple[Record, ...]:
             monotonic_ns=last.monotonic_ns,
             payload=LOST,
         )
-        for index, (episode, last) in enumerate(sorted(prefix.open.items()))
+        for index, (episode, last) in enumerate(open_)
     )
 
 

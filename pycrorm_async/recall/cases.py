@@ -516,7 +516,7 @@ class EpisodeCases:
             self._after = action.type, status
         else:
             action.scope.after = action.type, status
-        duration_s = (monotonic_ns - action.monotonic_ns) / 1e9 if status != "LOST" else None
+        duration_s = (monotonic_ns - action.monotonic_ns) / 1e9 if ended.has_time else None
         reason = reason_of(failure) if failure is not None else None
         return action.case(status, reason, duration_s)
 

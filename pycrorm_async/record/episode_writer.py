@@ -47,6 +47,7 @@ from pycrorm_async.record.declarations import Declared, DeclaredType
 from pycrorm_async.record.event_feed import EventFeed
 from pycrorm_async.record.geometry import Descriptions
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, end_statuses, episode_started
+from pycrorm_async.record.recorded_before import RecordedBefore
 from pycrorm_async.record.values import (
     MissingValues,
     ValueReader,
@@ -71,9 +72,10 @@ class EpisodeWriter:
 
     Attributes:
         emitter: has the queue, and counts faults.
-        id: 16 bytes of a UUIDv7; `str(episode)` is its text.
+        id: 16 bytes of a UUID; `str(episode)` is its text.
         closed: whether the last event has been written, or its writing has begun.
         simulated: whether the episode is a simulation.
+        refusal: of a named episode: why nothing more is recorded, although it has no end; None without a reason.
     """
 
     def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
@@ -88,6 +90,11 @@ class EpisodeWriter:
         self._is_begun = False
         self._is_ended = False
         self._root = 0
+        self.time: tuple[int, int] | None = None
+        """The wall time and the monotonic time of the next events, ns; None for those of the clock."""
+        self.refusal: str | None = None
+        self._recorded: RecordedBefore | None = None
+        self._stored = 0
 
     def __str__(self) -> str:
         return episode_text(self.id)
@@ -136,14 +143,33 @@ class EpisodeWriter:
         heading = self._headings.get(kind)
         if heading is None:
             heading = self._headings[kind] = Heading(self.id, kind.__name__, kind.version)
+        if self._recorded is not None and (sequence := self._stored_before(heading, payload)):
+            return sequence
         try:
-            sequence = emitter.sink.put_nowait(heading, payload, reserved=reserved)
+            sequence = emitter.sink.put_nowait(heading, payload, reserved=reserved, at=self.time, after=self._stored)
         except SpoolFull:
             if not reserved:
                 raise
-            sequence = emitter.put_payload(heading, payload)
+            sequence = emitter.put_payload(heading, payload, at=self.time, after=self._stored)
+        self._stored = 0  # the queue has the episode's sequence from now on
         if emitter.feed.observers:
             emitter.feed.publish(self.id, sequence, event)
+        return sequence
+
+    def _stored_before(self, heading: Heading, payload: bytes) -> int:
+        """Return the sequence that this event has in the log; 0 behind the last stored one, where writing continues.
+
+        Raises `CallerError` if another event is stored in its place; then nothing more is recorded.
+        """
+        assert self._recorded is not None
+        try:
+            sequence = self._recorded.sequence_of(heading, payload)
+        except Exception as error:
+            self.refusal = message_of(error)
+            self.closed = self._is_ended = True
+            raise
+        if sequence == 0:
+            self._stored, self._recorded = self._recorded.head, None
         return sequence
 
     def open(self) -> None:
@@ -200,7 +226,15 @@ class EpisodeWriter:
         self._open[sequence] = owner
         return sequence
 
-    def put_end(self, node: int, status: NodeStatus, failure: FailureValue | None = None, result: Any = None) -> None:
+    def put_end(
+        self,
+        node: int,
+        status: NodeStatus,
+        failure: FailureValue | None = None,
+        result: Any = None,
+        *,
+        untimed: bool = False,
+    ) -> None:
         """Write the end of a node; no effect if it has ended, as the garbage collector may cause meanwhile."""
         self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
         try:
@@ -211,7 +245,7 @@ class EpisodeWriter:
                     for name, value in parts.items():
                         for each in missing_in(value):
                             self.emitter.missing.note(owner, name, each.missing)
-                self.put(NodeEnded(node, status, failure, result), owner)
+                self.put(NodeEnded(node, status, failure, result, untimed), owner)
         finally:
             self._ending.discard(node)
 
@@ -220,7 +254,8 @@ class EpisodeWriter:
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
         """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.
 
-        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written.
+        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written; and if
+        its own status is not known, UNKNOWN.
 
         After a call that Ctrl-C interrupted, the next call writes what is missing.
         """
@@ -231,7 +266,8 @@ class EpisodeWriter:
         status, root_status = self._end_statuses(failure)
         value = failure_value(failure, self) if failure is not None else None
         for sequence in sorted(self._open.keys() - {self._root}, reverse=True):
-            self.put_end(sequence, root_status if status == "INTERRUPTED" else "LOST")
+            is_same = status in ("INTERRUPTED", "UNKNOWN")
+            self.put_end(sequence, root_status if is_same else "LOST", untimed=status == "UNKNOWN")
         deadline = time.monotonic() + _LAST_ENDS_S
         while self._ending and time.monotonic() < deadline:
             time.sleep(0.001)  # other threads write the ends of nodes
@@ -311,11 +347,13 @@ class Emitter:
     def faults(self) -> Faults:
         return Faults(self._fault_count, self._last_fault)
 
-    def put_payload(self, heading: Heading, payload: bytes) -> int:
+    def put_payload(
+        self, heading: Heading, payload: bytes, *, at: tuple[int, int] | None = None, after: int = 0
+    ) -> int:
         """Append an encoded event and return its sequence; block while the spool and its reserve are full."""
         while True:
             try:
-                return self.sink.put_nowait(heading, payload, reserved=True)
+                return self.sink.put_nowait(heading, payload, reserved=True, at=at, after=after)
             except SpoolFull:
                 if is_of_memory():
                     raise
@@ -400,8 +438,19 @@ class Emitter:
 class EventSink(Protocol):
     """The producing end of a queue."""
 
-    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+    def put_nowait(
+        self,
+        heading: Heading,
+        payload: bytes,
+        *,
+        reserved: bool = False,
+        at: tuple[int, int] | None = None,
+        after: int = 0,
+    ) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
+
+        `at` is its wall time and its monotonic time, by default those of the clock. `after` is, of the first event of a
+        named episode that earlier recorders began, the last sequence that they stored.
 
         Any thread may call it. Once it returns, the event survives the death of the process. Raises `SpoolFull` if
         there is no room; with `reserved`, only if the reserve for ends and world observations is used up as well.
@@ -618,11 +667,12 @@ class OpenEpisodes:
     Attributes:
         by_id: the open episodes.
         opened_count: the number of episodes opened, without simulations.
+        clock: the clock of the memory.
     """
 
     def __init__(self, emitter: Emitter, clock: Clock, randomness: Callable[[int], bytes] = os.urandom) -> None:
         self._emitter = emitter
-        self._clock = clock
+        self.clock = clock
         self._randomness = randomness
         self.by_id: dict[EpisodeId, EpisodeWriter] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
@@ -632,13 +682,15 @@ class OpenEpisodes:
 
     def new_id(self) -> EpisodeId:
         """Make the id of a new episode."""
-        return episode_id(self._clock.wall_ns(), self._randomness(10))
+        return episode_id(self.clock.wall_ns(), self._randomness(10))
 
     def add(self, episode: EpisodeWriter) -> None:
         """Add an episode. Raises `CallerError` after `refuse_new`."""
         with self._adding:
             if self._is_closing:
                 raise CallerError("the memory is being closed")
+            if episode.id in self.by_id:
+                raise CallerError(f"the episode {episode} is open already")
             self.by_id[episode.id] = episode
         if not episode.simulated:
             self._recent.append(episode.id)

@@ -158,7 +158,7 @@ Failures: TypeAlias = tuple[type[BaseException], ...]
 
 
 class EpisodeOpening(NamedTuple):
-    """The arguments an episode is opened with."""
+    """The arguments an episode is opened with; `is_past` if it happened at other times than those of the clock."""
 
     description: str
     software: str
@@ -169,6 +169,8 @@ class EpisodeOpening(NamedTuple):
     thought_by: NodeReference | None = None
     provenance: Provenance | None = None
     labels: Labels = NO_LABELS
+    created_by: str | None = None
+    is_past: bool = False
 
     def with_tags(self, tags: tuple[str, ...]) -> EpisodeOpening:
         """Return the arguments with these tags instead."""
@@ -177,9 +179,12 @@ class EpisodeOpening(NamedTuple):
 
 def episode_started(opening: EpisodeOpening) -> EpisodeStarted:
     """Build the first event of an episode."""
+    provenance = opening.provenance.fields() if opening.provenance is not None else {}
+    if opening.is_past:
+        provenance |= {"clock_synchronized": None, "clock_error_us": None}
     return EpisodeStarted(
         description=clean(opening.description),
-        created_by=clean(_user()),
+        created_by=clean(_user() if opening.created_by is None else opening.created_by),
         host=clean(platform.node()),
         software=opening.software,
         python=platform.python_version(),
@@ -190,7 +195,7 @@ def episode_started(opening: EpisodeOpening) -> EpisodeStarted:
         thought_by=opening.thought_by,
         tags=opening.labels.tags,
         metadata=dict(opening.labels.metadata),
-        **(opening.provenance.fields() if opening.provenance is not None else {}),
+        **provenance,
     )
 
 

@@ -3,42 +3,34 @@
 from __future__ import annotations
 
 import functools
-import math
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from os import PathLike
 from types import TracebackType
-from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar, cast, get_args
+from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar, get_args
 
-import msgspec
 from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.fields import checked_tags
+from pycrorm_async.events.ids import EpisodeId, is_named
 from pycrorm_async.events.reasons import UNNAMED, template_of
 from pycrorm_async.events.types import ObjectDetected
+from pycrorm_async.record.arguments import ArgumentReader, Convert, RecordedValues, pose_of, struct_of
 from pycrorm_async.record.declarations import DeclaredType
 from pycrorm_async.record.episode_writer import Emitter, EpisodeWriter, OpenEpisodes, is_of_memory, put_observation
-from pycrorm_async.record.geometry import mass_of, urdf_of
-from pycrorm_async.record.objects import RecordedObject, RecordedObjects
+from pycrorm_async.record.event_times import At, EventTimes
+from pycrorm_async.record.objects import RecordedObjects
 from pycrorm_async.record.opening import EpisodeOpening, Failures, end_statuses
+from pycrorm_async.record.recorded_before import RecordedBefore, StoredEpisode, StoredEpisodes
 from pycrorm_async.record.values import (
-    MissingValues,
     PoseLike,
-    RefusedValue,
-    clean,
     clean_repr,
     encode_or_missing,
-    failure_value,
     message_of,
-    missing_value,
-    pose_value,
-    read_parameters,
-    reading_fault,
-    recorded_as,
 )
 
 # === ordered calls ============================================================================================
@@ -156,7 +148,6 @@ FOREVER_S = 1e8
 """The seconds that a start waits for room: three years, because a wait takes a number."""
 FailureCause: TypeAlias = BaseException | event_types.FailureValue | tuple[str, str] | str
 """A failure as an executive gives it: an exception, a pair of reason and message, or a text."""
-Convert: TypeAlias = Callable[[Any], Any]
 END_STATUSES = tuple(each for each in get_args(event_types.NodeStatus) if each != "RUNNING")
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
@@ -188,7 +179,13 @@ class RecordedEpisode(EpisodeWriter):
 
     Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. No method
     raises: values that cannot be recorded are counted in `Memory.status` and logged. `node` is always the key of the
-    acting node; None means the root of the episode.
+    acting node; None means the root of the episode. `at` is always the time at which it happened (`event_times.At`);
+    without it, it happens now, or, in an episode that began at a given time, with what happened before it.
+
+    Attributes:
+        is_recorded: whether the log has this episode with its end already; nothing is recorded then.
+        refusal: why nothing more is recorded of an episode with a name of its own: the log cannot be read, or has other
+            events of this name; None without a reason.
     """
 
     def __init__(
@@ -199,12 +196,19 @@ class RecordedEpisode(EpisodeWriter):
         opening: EpisodeOpening,
         convert: Convert | None,
         failures: Failures = (),
+        *,
+        id: EpisodeId | None = None,  # noqa: A002  the field's word
+        at: At | None = None,
     ) -> None:
-        super().__init__(emitter, episodes.new_id(), opening)
+        super().__init__(emitter, episodes.new_id() if id is None else id, opening)
+        self._times = EventTimes(episodes.clock, at)
+        self.time = self._times.began
+        self.is_recorded = False
         self._episodes = episodes
         self._failures = failures
         self._calls = calls
         self._end_status: event_types.EpisodeStatus | None = None
+        self._end_at: At | None = None
         self._nodes: dict[Hashable, _Node] = {}
         self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
         self._objects = RecordedObjects(self)
@@ -219,12 +223,21 @@ class RecordedEpisode(EpisodeWriter):
     ) -> None:
         self.close(error)
 
-    def close(self, failure: BaseException | None = None, status: event_types.EpisodeStatus | None = None) -> None:
+    def close(
+        self,
+        failure: BaseException | None = None,
+        status: event_types.EpisodeStatus | None = None,
+        *,
+        at: At | None = None,
+    ) -> None:
         """End the episode. Without a failure it SUCCEEDED, and nodes that are still open are counted.
 
-        They end LOST, or CANCELLED in an episode that was INTERRUPTED.
-        `status` is FAILED, ERROR or INTERRUPTED, by default as for `end`.
+        They end LOST, CANCELLED in an episode that was INTERRUPTED, or UNKNOWN, without a time, in one whose status is
+        UNKNOWN. An episode with a name of its own that is interrupted gets no end, so that it can be continued.
+
+        `status` is FAILED, ERROR, INTERRUPTED or UNKNOWN, by default as for `end`.
         """
+        self._end_at = at
         if isinstance(status, str) and status in get_args(event_types.EpisodeStatus):
             self._end_status = status
         self._episodes.close(self, failure)
@@ -237,19 +250,31 @@ class RecordedEpisode(EpisodeWriter):
             self.emitter.note_unrecorded(f"a call of `{method}`")
         return False
 
-    def write(self, event_type: str, write: Callable[[], object]) -> None:
+    def write(self, event_type: str, write: Callable[[], object], at: At | None = None) -> None:
         """Call `write` after all earlier calls, unless the episode has ended; count its exceptions."""
 
         def run() -> None:
             if self.closed:
-                self._note(event_type, f"episode {self} has ended")
+                if not self.is_recorded and self.refusal is None:
+                    self._note(event_type, f"episode {self} has ended")
                 return
             try:  # not `noted`, because this is called for each event
+                self._set_time(event_type, at)
                 write()
             except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
                 self.emitter.note_fault(event_type, error)
 
         self._calls.run(run)
+
+    def _set_time(self, event_type: str, at: At | None) -> None:
+        """Set the time of the next event; a wrong one is counted, and the event happens as without it."""
+        try:
+            self.time, warning = self._times.next(at)
+        except CallerError as error:
+            self.emitter.note_fault(event_type, error)
+            self.time, warning = self._times.next(None)
+        if warning is not None:
+            self._note(event_type, warning)
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
@@ -261,6 +286,7 @@ class RecordedEpisode(EpisodeWriter):
         *,
         parent: Hashable | None = None,
         robot: event_types.RobotValue | Hashable | None = None,
+        at: At | None = None,
     ) -> Hashable:
         """Record that a node started; return it.
 
@@ -278,10 +304,16 @@ class RecordedEpisode(EpisodeWriter):
         """
         if not self.is_recording("start", "NodeStarted"):
             return None
-        return noted(self.emitter, "NodeStarted", self._start, key, type, parameters, parent, robot)
+        return noted(self.emitter, "NodeStarted", self._start, key, type, parameters, parent, robot, at)
 
     def _start(
-        self, key: Hashable, declared: DeclaredType, given: Mapping[str, Any], parent: Hashable | None, robot: object
+        self,
+        key: Hashable,
+        declared: DeclaredType,
+        given: Mapping[str, Any],
+        parent: Hashable | None,
+        robot: object,
+        at: At | None,
     ) -> _Node:
         hash(key)
         if self.emitter.must_wait() and not is_of_memory():
@@ -289,7 +321,7 @@ class RecordedEpisode(EpisodeWriter):
         missing: dict[str, str] = {}
         parameters = noted(self.emitter, "NodeStarted", self._values.parameters, declared, given, self, missing) or {}
         node = _Node(key, declared, parameters)
-        self.write("NodeStarted", lambda: self._start_node(node, parent, robot, missing))
+        self.write("NodeStarted", lambda: self._start_node(node, parent, robot, missing), at)
         return node
 
     def _start_node(self, node: _Node, parent: Hashable | None, robot: object, missing: dict[str, str]) -> None:
@@ -324,6 +356,8 @@ class RecordedEpisode(EpisodeWriter):
         result: Any = None,
         *,
         below: event_types.NodeStatus | None = None,
+        at: At | None = None,
+        untimed: bool = False,
     ) -> Callable[[], object]:
         """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR.
 
@@ -331,12 +365,14 @@ class RecordedEpisode(EpisodeWriter):
 
         Args:
             status: by default SUCCEEDED without a failure, FAILED for a plan failure, a text or a pair of texts,
-                CANCELLED for a cancellation, Ctrl-C or an exit, and ERROR for any other exception.
+                CANCELLED for a cancellation, Ctrl-C or an exit, and ERROR for any other exception. UNKNOWN is for an
+                end of which the executive does not report how it ended.
             failure: why it failed: an exception, whose class is the reason by which failures are counted; a pair of
                 reason and message; or a text, whose reason is the text without its numbers, ids, names of objects and
                 values of the node's own parameters.
             result: what it returned.
             below: first end the nodes that are open below this one, the innermost first, with this status.
+            untimed: the time of the end is not known, so that tables show none.
         """
         key = key.key if isinstance(key, _Node) and self._nodes.get(key.key) is key else key
         hash(key)
@@ -346,7 +382,18 @@ class RecordedEpisode(EpisodeWriter):
         own, lower = self._checked_status(status), self._checked_status(below) if below is not None else None
         value = noted(self.emitter, "NodeEnded", self._values.failure, failure, self) if failure is not None else None
         encoded = encode_or_missing(self._values.converted(result), self) if result is not None else None
-        return lambda: self._end_open(key, own, value, encoded, lower)
+        return self._timed("NodeEnded", at, lambda: self._end_open(key, own, value, encoded, lower, untimed=untimed))
+
+    def _timed(self, event_type: str, at: At | None, write: Callable[[], object]) -> Callable[[], object]:
+        """Return a call that writes events of a given time."""
+        if at is None:
+            return write
+
+        def timed() -> object:
+            self._set_time(event_type, at)
+            return write()
+
+        return timed
 
     def _checked_status(self, status: event_types.NodeStatus) -> event_types.NodeStatus:
         if status in END_STATUSES:
@@ -361,18 +408,20 @@ class RecordedEpisode(EpisodeWriter):
         failure: event_types.FailureValue | None,
         result: Any,
         below: event_types.NodeStatus | None,
+        *,
+        untimed: bool,
     ) -> None:
         node = self._nodes.get(key)
         if node is None:
             raise CallerError(f"no open node has the key {clean_repr(key)}")
         if below is not None:
             for each in [each for each in reversed(self._nodes.values()) if _is_below(each, node)]:
-                self._end_node(each, below)
+                self._end_node(each, below, untimed=untimed)
         if failure is not None and failure.type == UNNAMED:
             parameters = (each for each in node.parameters.values() if isinstance(each, str))
             template = template_of(failure.message, (*parameters, *self._objects.names()))
             failure = replace(failure, type=template or UNNAMED)
-        self._end_node(node, status, failure, result)
+        self._end_node(node, status, failure, result, untimed=untimed)
 
     def _end_node(
         self,
@@ -380,8 +429,10 @@ class RecordedEpisode(EpisodeWriter):
         status: event_types.NodeStatus,
         failure: event_types.FailureValue | None = None,
         result: Any = None,
+        *,
+        untimed: bool = False,
     ) -> None:
-        self.put_end(node.sequence, status, failure, result)
+        self.put_end(node.sequence, status, failure, result, untimed=untimed)
         self._nodes.pop(node.key, None)
         node.parameters = {}
         while node.parent is not None and self._nodes.get(node.parent.key) is not node.parent:
@@ -425,6 +476,7 @@ class RecordedEpisode(EpisodeWriter):
         base_link: str | None = None,
         torso_joint: str | None = None,
         node: Hashable | None = None,
+        at: At | None = None,
     ) -> Callable[[], object]:
         """Record that an object entered the world; for a known key, record its new pose and joints.
 
@@ -442,29 +494,40 @@ class RecordedEpisode(EpisodeWriter):
             name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
             base_link=base_link, torso_joint=torso_joint,
         )  # fmt: skip
-        return lambda: self._objects.add(key, added, self._cause(node))
+        return self._timed("ObjectAdded", at, lambda: self._objects.add(key, added, self._cause(node)))
 
     @reported("ObjectMoved")
     def object_moved(
-        self, key: Hashable, pose: PoseLike | event_types.PoseValue, *, node: Hashable | None = None
+        self,
+        key: Hashable,
+        pose: PoseLike | event_types.PoseValue,
+        *,
+        node: Hashable | None = None,
+        at: At | None = None,
     ) -> Callable[[], object]:
         """Record the new pose of an object, unless it is the same."""
         if not self.closed and self._objects.is_at(key, pose):
             return lambda: None  # before the pose is copied, which takes longer
         copied = pose_of(pose)
-        return lambda: self._objects.move(self._known(key), copied, self._cause(node))
+        return self._timed("ObjectMoved", at, lambda: self._objects.move(self._known(key), copied, self._cause(node)))
 
     @reported("JointsMoved")
     def joints_moved(
-        self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None
+        self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None, at: At | None = None
     ) -> Callable[[], object]:
         """Record new joint positions (rad or m); only those that changed."""
         copied = self._arguments.joints_of(joints)
-        return lambda: self._objects.turn(self._known(key), copied, self._cause(node))
+        return self._timed("JointsMoved", at, lambda: self._objects.turn(self._known(key), copied, self._cause(node)))
 
     @reported("ObjectAttached")
     def object_attached(
-        self, parent: Hashable, child: Hashable, link: str | None = None, *, node: Hashable | None = None
+        self,
+        parent: Hashable,
+        child: Hashable,
+        link: str | None = None,
+        *,
+        node: Hashable | None = None,
+        at: At | None = None,
     ) -> Callable[[], object]:
         """Record that `child` moves with `link` of `parent` from now on."""
         name = self._arguments.text_of("link", link)
@@ -472,23 +535,25 @@ class RecordedEpisode(EpisodeWriter):
         def write() -> int:
             return self._objects.attach(self._known(parent), self._known(child), name, self._cause(node))
 
-        return write
+        return self._timed("ObjectAttached", at, write)
 
     @reported("ObjectDetached")
     def object_detached(
-        self, parent: Hashable, child: Hashable, *, node: Hashable | None = None
+        self, parent: Hashable, child: Hashable, *, node: Hashable | None = None, at: At | None = None
     ) -> Callable[[], object]:
         """Record that `child` no longer moves with `parent`."""
 
         def write() -> int:
             return self._objects.detach(self._known(parent), self._known(child), self._cause(node))
 
-        return write
+        return self._timed("ObjectDetached", at, write)
 
     @reported("ObjectRemoved")
-    def object_removed(self, key: Hashable, *, node: Hashable | None = None) -> Callable[[], object]:
+    def object_removed(
+        self, key: Hashable, *, node: Hashable | None = None, at: At | None = None
+    ) -> Callable[[], object]:
         """Record that an object left the world."""
-        return lambda: self._objects.remove(self._known(key), self._cause(node))
+        return self._timed("ObjectRemoved", at, lambda: self._objects.remove(self._known(key), self._cause(node)))
 
     def reference(self, key: Hashable) -> event_types.ObjectReference | None:
         """Return the current row of an object, for values that name it; None if there is none of this key.
@@ -500,7 +565,9 @@ class RecordedEpisode(EpisodeWriter):
     # --- observations -----------------------------------------------------------------------------------------
 
     @reported("Observed")
-    def observe(self, name: str, values: object, *, node: Hashable | None = None) -> Callable[[], object]:
+    def observe(
+        self, name: str, values: object, *, node: Hashable | None = None, at: At | None = None
+    ) -> Callable[[], object]:
         """Record an observation, as `Memory.observe` does."""
         copied = self._values.converted(values)
 
@@ -508,7 +575,7 @@ class RecordedEpisode(EpisodeWriter):
             observer = self.node_or_root(self._find(node, "Observed"))
             return put_observation(self, name, copied, observer, may_refuse=False)
 
-        return write
+        return self._timed("Observed", at, write)
 
     @reported("ObjectDetected")
     def detected(
@@ -518,6 +585,7 @@ class RecordedEpisode(EpisodeWriter):
         source: Literal["camera", "world_state"] = "camera",
         object_type: str | None = None,
         node: Hashable | None = None,
+        at: At | None = None,
     ) -> Callable[[], object]:
         """Record a result of perception; `object_type` is the type searched for."""
         copied = (noted(self.emitter, "ObjectDetected", struct_of, each, event_types.SeenValue) for each in seen)
@@ -530,14 +598,14 @@ class RecordedEpisode(EpisodeWriter):
             held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
             return self.put(replace(event, seen=tuple(held), node=number))
 
-        return write
+        return self._timed("ObjectDetected", at, write)
 
     @reported("EpisodeTagged")
-    def tag(self, *tags: str, remove: Sequence[str] = ()) -> Callable[[], object]:
+    def tag(self, *tags: str, remove: Sequence[str] = (), at: At | None = None) -> Callable[[], object]:
         """Add and remove tags."""
         added, removed = checked_tags(tags), checked_tags(remove)
 
-        return lambda: EpisodeWriter.change_tags(self, added, removed)
+        return self._timed("EpisodeTagged", at, lambda: EpisodeWriter.change_tags(self, added, removed))
 
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
         """Block while the spool is full, for a limited time; return whether it has room now.
@@ -552,25 +620,49 @@ class RecordedEpisode(EpisodeWriter):
 
     # --- the writer's part ------------------------------------------------------------------------------------
 
-    def open(self) -> None:
-        """Write the start of the episode; if that fails, count the fault, and record nothing."""
-        self._calls.run(self._open_now)
+    def open(self, stored: StoredEpisodes | None = None) -> None:
+        """Write the start of the episode; if that fails, count the fault, and record nothing.
 
-    def _open_now(self) -> None:
+        With `stored`, continue the episode behind the events that the log has of it; see `is_recorded`.
+        """
+        before = None
+        if stored is not None and self.id not in self._episodes.by_id:
+            try:
+                before = stored.find(self.id)
+            except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+                self.emitter.note_fault("EpisodeStarted", error)
+                self.closed, self.refusal = True, message_of(error)
+                return
+        if before is not None and before.has_ended:
+            self.closed = self.is_recorded = True
+        else:
+            self._calls.run(lambda: self._open_now(before))
+
+    def _open_now(self, before: StoredEpisode | None) -> None:
+        is_added = False
         try:
             self._episodes.add(self)
+            is_added = True
+            if before is not None:
+                self._recorded = RecordedBefore(self.id, before)
             super().open()
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self.emitter.note_fault("EpisodeStarted", error)
-            self._episodes.by_id.pop(self.id, None)
+            if is_added:
+                self._episodes.by_id.pop(self.id, None)
             self.closed = True
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
-        """Write the end of the episode."""
+        """Write the end of the episode; leave a named one that is interrupted without an end."""
         self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure, world))
 
     def _end_now(self, failure: BaseException | None, world: str | None) -> None:
-        if (left := len(self._nodes)) and failure is None and not self.closed:
+        if is_named(self.id) and not self.closed and self._end_statuses(failure)[0] == "INTERRUPTED":
+            self.closed = self._is_ended = True
+            return
+        if not self.closed:
+            self._set_time("EpisodeEnded", self._end_at)
+        if (left := len(self._nodes)) and failure is None and not self.closed and self._end_status != "UNKNOWN":
             self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {left}")
         super().end_episode(failure, world)
         self._nodes.clear()
@@ -624,230 +716,3 @@ def _is_below(node: _Node, ancestor: _Node) -> bool:
     while above is not None and above is not ancestor:
         above = above.parent
     return above is not None
-
-
-# === checked arguments ========================================================================================
-#
-# Copy the arguments of an executive, because a value of a wrong type in the log would stop the fold of its episode.
-#
-# A wrong value raises `CallerError` if it is required (a pose); an optional one (a colour, one joint) is counted as
-# missing.
-
-_INTEGERS = range(-(2**63), 2**63)
-_UNIT_TOLERANCE = 1e-6
-"""A quaternion whose length differs from 1 by less keeps its bits: it is that of an executive in single precision."""
-
-S = TypeVar("S", bound=msgspec.Struct)
-
-
-def struct_of(value: object, kind: type[S]) -> S:
-    """Return a value of this class whose parts, or numbers of numpy, have the declared types. Raises `CallerError`."""
-    if not isinstance(value, kind):
-        raise CallerError(f"expected a {kind.__name__}, got {clean_repr(value)}")
-    try:
-        parts = msgspec.to_builtins(value, enc_hook=lambda number: number.tolist())
-        return _with_unit_turn(msgspec.convert(parts, kind))
-    except Exception as error:
-        raise CallerError(f"not a whole {kind.__name__}: {message_of(error)}") from error
-
-
-def _with_unit_turn(value: S) -> S:
-    """Return a pose, or a value with a pose, with a quaternion of length 1, from which a rotation is computed."""
-    if isinstance(value, event_types.PoseValue):
-        length = math.hypot(*value.orientation)
-        if 0 < length < math.inf and abs(length - 1) > _UNIT_TOLERANCE:
-            return replace(value, orientation=tuple(each / length for each in value.orientation))
-    elif isinstance(pose := getattr(value, "pose", None), event_types.PoseValue):
-        return replace(value, pose=_with_unit_turn(pose))
-    return value
-
-
-def pose_of(pose: PoseLike | event_types.PoseValue) -> event_types.PoseValue:
-    """Copy a pose. Raises `CallerError`, also for a number that is not finite."""
-    value = (
-        struct_of(pose, event_types.PoseValue)
-        if recorded_as(type(pose)) is None
-        else pose_value(cast("PoseLike", pose))
-    )
-    if not math.isfinite(sum(value.position) + sum(value.orientation)):
-        raise CallerError(f"the pose holds a number that is not finite: {clean_repr(pose)}")
-    if value.time_ns not in _INTEGERS:
-        raise CallerError(f"the time of the pose does not fit into 64 bits: {clean_repr(pose)}")
-    return value
-
-
-def _are_plain(joints: dict[Any, Any]) -> bool:
-    """Return whether all names are ASCII texts and all positions finite floats, so that none of them must change."""
-    if set(map(type, joints)) != {str} or set(map(type, joints.values())) != {float}:
-        return False
-    names = "".join(joints)
-    return names.isascii() and "\0" not in names and all(map(math.isfinite, joints.values()))
-
-
-class ArgumentReader:
-    """Copies the arguments that describe an object; counts the ones that it has to leave out in `missing`."""
-
-    def __init__(self, missing: MissingValues) -> None:
-        self._missing = missing
-
-    def object_of(
-        self,
-        name: str,
-        object_type: str | Enum,
-        pose: PoseLike | event_types.PoseValue,
-        joints: Mapping[str, float],
-        **others: Any,
-    ) -> RecordedObject:
-        """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
-        urdf, kind = urdf_of(name, others["urdf"], self._missing), self.text_of("object_type", object_type) or "UNKNOWN"
-        mass_kg = self._number_of("mass_kg", others["mass_kg"])
-        if mass_kg is None:
-            mass_kg = mass_of(urdf, kind)
-        texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
-        return RecordedObject(
-            self.text_of("name", name) or "an object",
-            kind,
-            pose_of(pose),
-            self.joints_of(joints),
-            urdf=urdf,
-            color=self._color_of(others["color"]),
-            mass_kg=mass_kg,
-            **texts,
-        )
-
-    def text_of(self, argument: str, text: object) -> str | None:
-        """Copy a text; of an enum its member's name, of another value its shortened repr."""
-        if text is None:
-            return None
-        if isinstance(text, Enum):
-            return clean(str(text.name))
-        if isinstance(text, str):
-            return clean(str.__str__(text))
-        self._missing.note("ObjectAdded", argument, f"it must be a text, not {clean_repr(text)}")
-        return clean_repr(text)
-
-    def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
-        """Copy joint positions; those that are not finite numbers are counted as missing."""
-        if not isinstance(joints, Mapping):
-            self._missing.note("JointsMoved", "joints", f"they must be positions by name, not {clean_repr(joints)}")
-            return {}
-        copied = dict(joints)
-        if _are_plain(copied):  # as nearly all are; the checks below take twenty times as long
-            return copied
-        positions: dict[str, float] = {}
-        for name, position in copied.items():
-            text = self.text_of("joint", name)
-            number = self._number_of("joints", position)
-            if text is not None and number is not None:
-                positions[text] = number
-        return positions
-
-    def _number_of(self, argument: str, number: Any) -> float | None:
-        if number is None:
-            return None
-        try:
-            if isinstance(number, str | bytes | bool) or not math.isfinite(number):
-                raise ValueError("it must be a finite number")  # noqa: TRY301  counted below
-            return float(number)
-        except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
-            self._missing.note("ObjectAdded", argument, f"{clean_repr(number)}: {message_of(error)}")
-            return None
-
-    def _color_of(self, color: Any) -> tuple[float, float, float, float] | None:
-        if color is None:
-            return None
-        parts = [self._number_of("color", each) for each in color] if isinstance(color, list | tuple) else []
-        red, green, blue, opacity, *_ = (*parts, None, None, None, None)
-        if len(parts) != 4 or red is None or green is None or blue is None or opacity is None:
-            self._missing.note("ObjectAdded", "color", f"it must be red, green, blue and opacity: {clean_repr(color)}")
-            return None
-        return red, green, blue, opacity
-
-
-# === recorded values ==========================================================================================
-#
-# Copy the values of an executive, through its own conversion, into values of events.
-
-
-class RecordedValues:
-    """Converts values for one episode. `convert` is the executive's; it is called with each value and each item."""
-
-    def __init__(self, convert: Convert | None, objects: RecordedObjects) -> None:
-        self._convert = convert
-        self._objects = objects
-
-    def parameters(
-        self, declared: DeclaredType, given: Mapping[Any, Any], episode: RecordedEpisode, missing: dict[str, str]
-    ) -> dict[str, Any]:
-        """Return the parameters by field name; add to `missing` the reason for each that becomes a `MissingValue`."""
-        source: dict[Any, Any] = {}
-        left = dict(given)
-        for field in declared.fields:
-            key = field.path[0]
-            value = left.pop(key, None)
-            if value is not None:
-                source[key] = self.converted(value, as_object=field.is_object)
-        parameters = read_parameters(source, declared.fields, episode, missing)
-        for name, value in left.items():
-            if value is not None:
-                text = clean(name) if isinstance(name, str) else clean_repr(name)
-                missing[text] = reason = f"{declared.dtype} was declared without this field"
-                parameters[text] = missing_value(reason, value)
-        return parameters
-
-    def converted(self, value: Any, *, as_object: bool = False) -> Any:
-        """Return the value as the executive converts it; a `RefusedValue` with the reason if it cannot convert it.
-
-        With `as_object` the key of an object becomes a reference to its row.
-        """
-        value = self._item(value, as_object)
-        kind = type(value)
-        if kind is list or kind is tuple:
-            return [self._item(each, as_object) for each in value]
-        if kind is dict:
-            return {key: self._item(each, as_object) for key, each in value.items()}
-        return value
-
-    def _item(self, value: Any, as_object: bool) -> Any:  # noqa: FBT001  a keyword would cost each item of a list
-        """Convert a value, but not the items inside it."""
-        if as_object and (reference := self._known_object(value)) is not None:
-            return reference
-        if self._convert is not None:
-            try:
-                value = self._convert(value)
-            except Exception as error:  # noqa: BLE001  an executive's conversion may raise anything
-                return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error), value)
-            if as_object and (reference := self._known_object(value)) is not None:
-                return reference
-        return self._checked(value) if isinstance(value, msgspec.Struct) else value
-
-    def failure(self, failure: object, episode: RecordedEpisode) -> event_types.FailureValue:
-        """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
-        match failure:
-            case BaseException():
-                return failure_value(failure, episode, self.converted)
-            case (str(), str()) | str():
-                reason, message = (UNNAMED, failure) if isinstance(failure, str) else failure
-                return event_types.FailureValue(clean(reason), clean(message))
-        return struct_of(failure, event_types.FailureValue)
-
-    def _checked(self, value: msgspec.Struct) -> Any:
-        """Return a value of an event if it is whole, and its rows are those of this episode."""
-        try:
-            if isinstance(value, event_types.PoseValue):
-                return pose_of(value)
-            whole = struct_of(value, type(value))
-        except CallerError as error:
-            return RefusedValue(message_of(error), value)
-        reference = whole.part_of if isinstance(whole, event_types.ObjectValue) else whole
-        if isinstance(reference, event_types.ObjectReference) and not self._objects.holds(reference):
-            return RefusedValue("it refers to a row that this episode does not have", value)
-        if isinstance(whole, event_types.ObjectValue) and whole.pose is not None:
-            return self._checked(whole.pose) if isinstance(self._checked(whole.pose), RefusedValue) else whole
-        return whole
-
-    def _known_object(self, value: Any) -> event_types.ObjectReference | None:
-        try:
-            return self._objects.reference(value)
-        except Exception:  # noqa: BLE001  it is not hashable, so it is no key
-            return None

@@ -7,13 +7,16 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Self, TypeAlias, cast, get_args
+from uuid import UUID
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.ids import SEQUENCE_MAX, parse_episode_id
+from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, named_episode_id, parse_episode_id
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeReference
 from pycrorm_async.record import declarations
+from pycrorm_async.record.arguments import Convert
 from pycrorm_async.record.declarations import RecordedKind
 from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
+from pycrorm_async.record.event_times import At, event_time
 from pycrorm_async.record.opening import (
     NO_LABELS,
     EpisodeOpening,
@@ -23,8 +26,9 @@ from pycrorm_async.record.opening import (
     check_arguments,
     read_labels,
 )
-from pycrorm_async.record.recorded_episode import Convert, OrderedCalls, RecordedEpisode
-from pycrorm_async.record.values import clean_repr
+from pycrorm_async.record.recorded_before import StoredEpisodes
+from pycrorm_async.record.recorded_episode import OrderedCalls, RecordedEpisode
+from pycrorm_async.record.values import clean, clean_repr
 
 _TYPES_MAX = 10_000
 """Bounds the types kept for reuse; when it is reached all are dropped."""
@@ -50,6 +54,7 @@ class Recording:
         known_types: the types that this memory has declared so far, shared with the recorder of our own plans.
         stored: the declarations that the database holds already, also from other processes.
         software, provenance: recorded with each episode.
+        stored_episodes: the episodes of the log, to continue one that has an id of its own.
     """
 
     def __init__(
@@ -61,12 +66,14 @@ class Recording:
         *,
         software: str,
         provenance: Provenance | None = None,
+        stored_episodes: StoredEpisodes | None = None,
     ) -> None:
         self.emitter = emitter
         self.episodes = episodes
         self.known_types = known_types
         self._software = software
         self._provenance = provenance
+        self._stored_episodes = stored_episodes
         self._calls = OrderedCalls()
         self._types: dict[_Arguments, declarations.DeclaredType] = {}
         self._prepared: dict[_Arguments, tuple[declarations.Declared, tuple[str | None, int]]] = {}
@@ -173,8 +180,18 @@ class Recording:
         thought_by: NodeReference | None = None,
         convert: Convert | None = None,
         failures: Failures = (),
+        id: str | UUID | None = None,  # noqa: A002  the field's word
+        at: At | None = None,
+        created_by: str | None = None,
     ) -> RecordedEpisode:
         """Start an episode; use it with `with`, or call its `close`. Any number may be open at a time.
+
+        An episode with an `id` is recorded once. If the log has it with its end, nothing is recorded, and `is_recorded`
+        is true. One with a name that the process before could not finish is continued: report all of it again in the
+        same order, and only what is not stored yet is written.
+
+        >>> with recording.episode(id="kitchen/2019-05-01.bag", at=1_556_700_000_000_000_000) as episode:
+        ...     episode.start("a", navigate, at=1_556_700_001_500_000_000)
 
         Args:
             description, plan, seed, tags, metadata: as for `Memory.episode`.
@@ -186,12 +203,22 @@ class Recording:
                 object. An exception that it raises is recorded as the reason why the value is missing.
             failures: the classes of the executive's own plan failures: nodes and episodes that one left are FAILED, and
                 those that another exception left are CANCELLED or ERROR.
+            id: a UUID, which is the id of the episode; or a name that only this episode has, of which its id is made
+                (UUIDv5). Blocks until all that was recorded before is stored, and the log has been read. Until a named
+                episode has an end it counts as RUNNING, also after its process died.
+            at: when it started, if not now; see `event_times.At`. All events of the episode then need an `at` too.
+            created_by: who recorded it; by default the user of this process.
 
         Raises:
             CallerError: an argument has the wrong type. Any other fault is counted, and the episode stays empty.
         """
         text = description or plan or "an episode"
         unchecked: tuple[object, object, object] = (simulated, seed, failures)  # as the caller passed them
+        identity = None if id is None else _identity(id)
+        if at is not None:
+            event_time(at)
+        if created_by is not None and not isinstance(created_by, str):
+            raise CallerError(f"created_by must be a str, not {created_by!r:.100}")
         if not isinstance(unchecked[0], bool) or isinstance(unchecked[1], bool):
             raise CallerError("simulated must be a bool, and seed an int")
         if convert is not None and not callable(convert):
@@ -206,12 +233,14 @@ class Recording:
             world=world,
             simulated=simulated,
             thought_by=thought_by,
+        )._replace(created_by=created_by, is_past=at is not None)
+        episode = RecordedEpisode(
+            self.emitter, self.episodes, self._calls, opening, convert, failures, id=identity, at=at
         )
-        episode = RecordedEpisode(self.emitter, self.episodes, self._calls, opening, convert, failures)
         if self.emitter.is_closed:
             self.emitter.note_unrecorded(f"the episode {text!r}")
         else:
-            episode.open()
+            episode.open(self._stored_episodes if identity is not None else None)
         return episode
 
     def opening(
@@ -252,6 +281,12 @@ def _arguments(
     aliases: Sequence[str] = (),
 ) -> _Arguments:
     return kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases)
+
+
+def _identity(id: object) -> EpisodeId:  # noqa: A002  the argument's name
+    if not isinstance(id, str | UUID) or not id or (isinstance(id, str) and clean(id) != id):
+        raise CallerError(f"the id of an episode must be a UUID, or a name that is not empty, not {id!r:.100}")
+    return named_episode_id(id)
 
 
 def _is_whole(reference: Any) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pycrorm_async.events.types import SeenValue
 from pycrorm_async.memory import Memory
-from pycrorm_async.record.recorded_episode import pose_of
+from pycrorm_async.record.arguments import pose_of
 from pycrorm_async.world import Pose
 
 BAD = "\x1b]0;owned\x07\x1b[31m\x9b32m\x9d8;;x\x9c\x85\x7f\u202e\u2066\u200f\r\x08"

@@ -44,7 +44,15 @@ class ListSink:
         self.before_end: Callable[[], None] = lambda: None
         """Called before the end of each node is put."""
 
-    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+    def put_nowait(
+        self,
+        heading: Heading,
+        payload: bytes,
+        *,
+        reserved: bool = False,
+        at: tuple[int, int] | None = None,
+        after: int = 0,
+    ) -> int:
         if heading.type == "NodeEnded":
             self.before_end()
         with self.lock:

@@ -325,7 +325,7 @@ def test_the_kinds_of_a_node_are_the_same_in_a_plan_and_in_the_log() -> None:
 def test_the_status_of_a_node_is_the_same_in_a_plan_and_in_the_log() -> None:
     in_the_plan = {status.name: status.value for status in TaskStatus}
     assert in_the_plan == {word: word for word in get_args(types.NodeStatus)}
-    assert len(in_the_plan) == 7
+    assert len(in_the_plan) == 8
 
 
 # === recorded types ===========================================================================================

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import select
@@ -219,10 +220,10 @@ async def test_a_fault_of_the_recorder_is_counted_and_the_motion_continues(case:
 
         put = case.sink.put_nowait
 
-        def broken(heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+        def broken(heading: Heading, payload: bytes, *, reserved: bool = False, **placed: Any) -> int:
             if heading.type == "StateSampled":
                 raise RuntimeError("the sampler is on fire")
-            return put(heading, payload, reserved=reserved)
+            return put(heading, payload, reserved=reserved, **placed)
 
         case.sink.put_nowait = broken  # type: ignore[method-assign]
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()

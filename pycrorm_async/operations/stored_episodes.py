@@ -1,0 +1,114 @@
+"""Read what a memory's log has of one episode, for a recording that continues it (`record.recorded_before`).
+
+A recording has no event loop of its own and may be called inside one, so each question runs in a thread of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Collection, Coroutine, Sequence
+from typing import Any, Final, TypeVar
+
+from pycrorm_async.errors import FlushTimeout
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.recorder_queue import RecorderQueue
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.record.recorded_before import StoredEpisode, StoredPayload
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+
+_PAGE_EVENTS: Final = 5_000
+"""Bounds the events of one page: each costs a connection, and few are larger than a kilobyte."""
+_PAUSE_S: Final = 0.01
+"""The pause between two looks whether all that was recorded before is stored."""
+T = TypeVar("T")
+
+
+class LogEpisodes:
+    """The episodes of the log at one address. Implements `record.recorded_before.StoredEpisodes`.
+
+    Args:
+        queue: the memory's own queue, all of whose records must be stored before the log is read.
+        unrecoverable: the names of folders of dead recorders that nobody can drain.
+        timeout_s: bounds the wait for the queue, and for the folders of dead recorders.
+    """
+
+    def __init__(
+        self,
+        address: DatabaseAddress,
+        spool: Spool,
+        queue: RecorderQueue,
+        unrecoverable: Collection[str],
+        *,
+        timeout_s: float,
+    ) -> None:
+        self._address = address
+        self._spool = spool
+        self._queue = queue
+        self._unrecoverable = unrecoverable
+        self._timeout_s = timeout_s
+
+    def find(self, episode: EpisodeId) -> StoredEpisode | None:
+        """Implement `StoredEpisodes.find`. Raises `FlushTimeout` if the writer stores nothing for too long."""
+        self._wait_until_stored()
+        row = _run(self._row(episode))
+        if row is None:
+            return None
+        number, head, ended_wall_ns = row
+        return StoredEpisode(
+            head,
+            ended_wall_ns is not None,
+            lambda after: _run(self._page(number, after, min(head, after + _PAGE_EVENTS))),
+        )
+
+    def _wait_until_stored(self) -> None:
+        position, deadline = self._queue.written, time.monotonic() + self._timeout_s
+        while self._queue.stored < position or self._dead_recorders():
+            if time.monotonic() > deadline:
+                raise FlushTimeout(self._timeout_s)
+            time.sleep(_PAUSE_S)
+
+    def _dead_recorders(self) -> list[str]:
+        """List the folders that a writer is about to drain; dead letters are none, because the log refused them."""
+        return [
+            each.name
+            for each in self._spool.recorders()
+            if not each.alive and each.refused is None and each.name not in self._unrecoverable
+        ]
+
+    async def _row(self, episode: EpisodeId) -> tuple[int, int, int | None] | None:
+        log = await EventLog.open(self._address, create=False)
+        try:
+            row = await log.episode(episode)
+        finally:
+            await log.close()
+        return None if row is None else (row.number, row.head, row.ended_wall_ns)
+
+    async def _page(self, number: int, after: int, last: int) -> Sequence[StoredPayload]:
+        log = await EventLog.open(self._address, create=False)
+        try:
+            events = await log.events(number, after=after, limit=last - after)
+        finally:
+            await log.close()
+        return [StoredPayload(each.sequence, each.type, each.version, each.payload) for each in events]
+
+
+def _run(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Run a coroutine in a loop and a thread of its own, and return its result."""
+    results: list[T] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            results.append(asyncio.run(coroutine))
+        except BaseException as error:  # noqa: BLE001  raised in the caller's thread
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name="pycrorm stored episodes")
+    thread.start()
+    thread.join()
+    for error in errors:
+        raise error
+    return results[0]
