@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 
+from pycrorm_async import core
 from pycrorm_async.cli.output import JsonOption, moment, note, print_json, print_table, problem, stdout
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.clock import SYSTEM_CLOCK
@@ -226,6 +227,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
                 "running": state.running,
                 "running_total": state.running_total,
                 "went_back": [each._asdict() for each in state.went_back],
+                "core": {"compiled": core.IS_COMPILED, "reason": core.PURE_REASON},
             }
         )
     else:
@@ -237,6 +239,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
         for projection in state.projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
+        stdout.print(core.description(), markup=False)
         for warning in state.warnings:
             note(f"warning: {warning}")
         if not has_daemon:

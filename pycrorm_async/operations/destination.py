@@ -340,7 +340,7 @@ def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
     """
     ready: list[Record] = []
     scanner = SegmentScanner(
-        Path(), parse_folder_name(recorder.name).recorder, on_record=ready.append, segments=recorder.segments
+        Path(), parse_folder_name(recorder.name).recorder, records=ready, segments=recorder.segments
     )
     yielded = 0
     more = True

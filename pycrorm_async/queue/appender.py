@@ -39,6 +39,7 @@ from threading import get_ident
 from typing import Final, NamedTuple
 from zlib import crc32
 
+from pycrorm_async import core
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import (
     CallerError,
@@ -115,7 +116,7 @@ class SyncSpan(NamedTuple):
     segments: tuple[Segment, ...]
 
 
-class Appender:
+class Appender(core.Tail):
     """An appender for any thread. Calls `wake` at the first record of a span and `hurry` after it began a segment.
 
     `make_room` frees a number of bytes on a full disk; it returns False if it has none to free.
@@ -137,19 +138,20 @@ class Appender:
         self._capacity = capacity
         self._events_max = capacity.events_max
         self._clock = clock
+        self._has_atomic_clock = all(isinstance(each, core.ATOMIC) for each in clock)
         self._wall_ns, self._monotonic_ns = clock
         self._wake = wake
         self._hurry = hurry
         self._make_room = make_room
-        self._gc_lock = GcSafeLock()
+        self._gc_lock = GcSafeLock(self)
         self._making = threading.Lock()
         self._type_names: dict[str, bytes] = {}
 
         self.position = 0
         self.declarations = RepeatedDeclarations(capacity.descriptions_bytes_max)
-        self.open: dict[EpisodeId, tuple[int, int, int]] = {}
+        self.open = {}
         self.begun: list[SegmentStart] = []
-        self._refusal: Callable[[], PycrormError] | None = None
+        self._refusal = None
         self.stuck: str | None = None  # why no segment will be deleted any more
         self._span_count = 0
         self._span_checksum = 0
@@ -177,19 +179,31 @@ class Appender:
         after: int = 0,
     ) -> int:
         """Append one event as `RecorderQueue.put_nowait` does."""
+        sequence = self.append(heading, payload, reserved) if at is None else None
+        return self._put(heading, payload, reserved, at, after) if sequence is None else sequence
+
+    def _put(
+        self,
+        heading: Heading,
+        payload: bytes,
+        reserved: bool,  # noqa: FBT001
+        at: tuple[int, int] | None,
+        after: int,
+    ) -> int:
+        """Append one event of any kind, or raise: the whole of `put`, which `append` does in part."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
         body = encode_body(name, payload)
         body_checksum = crc32(body)
         kind, owner, sequence, last = EVENT, episode or NO_EPISODE, 0, None
         gc_lock, thread = self._gc_lock, get_ident()
-        if gc_lock.owner == thread:
+        if self.owner == thread:
             raise gc_lock.reentered()
         with gc_lock.lock:
             try:
                 gc_lock.paused = paused = isenabled()
                 disable()
-                gc_lock.paused, gc_lock.owner = paused, thread
+                gc_lock.paused, self.owner = paused, thread
                 if self._refusal is not None:
                     raise self._refusal()
                 if episode is None:
@@ -243,7 +257,7 @@ class Appender:
                     self._wake()
                     self._quiet = False
             finally:
-                gc_lock.owner = 0
+                self.owner = 0
                 if gc_lock.paused:
                     gc_lock.paused = False
                     enable()
@@ -517,6 +531,7 @@ class Appender:
     @locked
     def close(self) -> None:
         """Close mappings and files; call `refuse` first."""
+        self._buffer = None  # a mapping in use cannot be closed
         for segment in (*self._sealed, self._current, self._prepared):
             if segment is not None:
                 segment.close()
@@ -524,7 +539,8 @@ class Appender:
     def abandon(self, refusal: Callable[[], PycrormError]) -> None:
         """Detach in a forked child: replace the locks, whose holders may be threads that the child does not have."""
         self._gc_lock.abandon()
-        self._gc_lock, self._making = GcSafeLock(), threading.Lock()
+        self.owner = 0
+        self._gc_lock, self._making = GcSafeLock(self), threading.Lock()
         self._refusal = refusal
         self.close()
 

@@ -114,7 +114,8 @@ class LiveBlobs:
         self._folder = folder
         self._reserve = reserve
         self._make_room = make_room
-        self._gc_lock = GcSafeLock()
+        self.owner = 0
+        self._gc_lock = GcSafeLock(self)
         self._blobs: dict[str, _Blob] = {}
         self._unsynced: set[str] = set()
         self._names = itertools.count(1)
@@ -146,7 +147,8 @@ class LiveBlobs:
     def abandon(self) -> None:
         """Detach in a forked child."""
         self._gc_lock.abandon()
-        self._gc_lock, self._blobs = GcSafeLock(), {}
+        self.owner = 0
+        self._gc_lock, self._blobs = GcSafeLock(self), {}
 
     @locked
     def _hold(self, name: str, size: int = 0) -> bool:

@@ -13,6 +13,7 @@ from struct import Struct, pack
 from typing import Final, NamedTuple, TypeAlias
 from zlib import crc32
 
+from pycrorm_async import core
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.codec import Record
@@ -410,6 +411,10 @@ def span_checksum(checksums: Sequence[int]) -> int:
 # uses `scan.py`.
 
 
+RECORDS_AT_ONCE: Final = 1_000
+"""Bounds the records taken by one call of the compiled core, which holds the interpreter lock: half a millisecond."""
+
+
 class ReadCursor(NamedTuple):
     """A place between two records: segment and offset of the next frame, and position of the record before it."""
 
@@ -472,7 +477,13 @@ class Reader:
         until = min(last, position + events_max - len(records))
         full = False
         while position < until and not full:
-            for frame in decode_each(self._buffer, offset, salt_of(self._recorder, number)):
+            salt, some = salt_of(self._recorder, number), min(until, position + RECORDS_AT_ONCE)
+            offset, position, total = core.take_records(
+                self._buffer, offset, salt, position, some, total, bytes_max, types, Record, records, None, None
+            )
+            if position == some:
+                continue
+            for frame in decode_each(self._buffer, offset, salt):
                 kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, _, size = frame
                 if kind != COMMIT:
                     total += len(payload)
@@ -490,7 +501,7 @@ class Reader:
                     values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
                     records.append(make(Record, values))
                 offset += size
-                if position == until:
+                if position == until or core.IS_COMPILED:
                     break
             else:
                 number, offset = number + 1, self._next_segment(number + 1, offset, position)

@@ -12,9 +12,11 @@ A collection that became due before may still run until `gc.disable` has returne
 `gc.enable` has. Nothing is half-written at these moments, so the lock is reentrant: a put from a finalizer is done
 there, inside the other one. It leaves `paused` as it needs it itself, so the outer put assigns it once more.
 
-`owner` is set while a record may be half-written. The collector is one switch for the whole process, so another queue
-or the program itself may turn it on meanwhile, and a signal handler may run at any time. A thread that meets its own
-id raises `InternalError`. Other threads may read a stale `owner`, but never their own id.
+The `owner` of the protected object is set while a record may be half-written. The collector is one switch for the whole
+process, so another queue or the program itself may turn it on meanwhile, and a signal handler may run at any time. A
+thread that meets its own id raises `InternalError`. Other threads may read a stale `owner`, but never their own id. The
+compiled core appends without this lock, in one step that no thread, finalizer or handler interrupts, and not while
+`owner` is set: so it never meets a half-written record, and never makes one.
 
 `pause_gc` extends the pause beyond the lock, for a thread that takes a second lock which a put may need too
 (`Appender._making`). It hands the pause from `paused` to `_pause_extended` under the lock, so there is no moment in
@@ -34,14 +36,20 @@ from pycrorm_async.errors import InternalError
 _T = TypeVar("_T")
 
 
+class Owned(Protocol):
+    """An object whose state a lock protects. `owner` is the id of the thread that changes it now, or 0."""
+
+    owner: int
+
+
 class GcSafeLock:
     """A lock and the pause of the garbage collector that belongs to it. `Appender.put` inlines `run` for speed."""
 
-    __slots__ = ("_pause_extended", "lock", "owner", "paused")
+    __slots__ = ("_guarded", "_pause_extended", "lock", "paused")
 
-    def __init__(self) -> None:
+    def __init__(self, guarded: Owned) -> None:
+        self._guarded = guarded
         self.lock = threading.RLock()
-        self.owner = 0
         self.paused = False
         self._pause_extended = False
 
@@ -50,17 +58,17 @@ class GcSafeLock:
 
         Not a context manager, because a KeyboardInterrupt in our `__enter__` would leave the lock taken.
         """
-        thread = threading.get_ident()
-        if self.owner == thread:
+        guarded, thread = self._guarded, threading.get_ident()
+        if guarded.owner == thread:
             raise self.reentered()
         with self.lock:
             try:
                 self.paused = paused = gc.isenabled()
                 gc.disable()
-                self.paused, self.owner = paused, thread
+                self.paused, guarded.owner = paused, thread
                 return work()
             finally:
-                self.owner = 0
+                guarded.owner = 0
                 if self.paused:
                     self.paused = False
                     gc.enable()

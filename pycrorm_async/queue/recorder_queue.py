@@ -27,13 +27,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from pycrorm_async import errors
+from pycrorm_async import core, errors
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
@@ -64,6 +65,13 @@ _LAST_SYNC_S = 30.0
 _log = logging.getLogger("pycrorm_async")
 _WAIT_WARNING_S = 2.0
 """A wait for room logs one warning if it takes longer than this."""
+
+
+@functools.cache
+def _note_core() -> None:
+    """Log once if the compiled core is missing."""
+    if not core.IS_COMPILED:
+        _log.info(core.description())
 
 
 class RecorderQueue:
@@ -125,6 +133,7 @@ class RecorderQueue:
         and `CallerError` for contradictory settings. Blocks for a few milliseconds to allocate the first segment.
         """
         Capacity.of(settings)  # raises for contradictory settings before anything is created
+        _note_core()
         folder, alive = make_folder(spool, episode_text(recorder), settings.file_access)
         try:
             return cls(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)

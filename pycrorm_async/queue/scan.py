@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from pycrorm_async import core
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record
@@ -38,7 +39,10 @@ from pycrorm_async.queue.format import (
     EVENT,
     FORMAT,
     HEADER_BYTES,
+    RECORDS_AT_ONCE,
+    SEGMENT_BYTES_MAX,
     Buffer,
+    Fields,
     Frame,
     LastRecord,
     ReadCursor,
@@ -122,7 +126,7 @@ def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[ReadCursor, Fra
 class SegmentScanner:
     """Scan from the oldest segment to the first hole, one segment per step.
 
-    Calls `on_frame` with each kept frame and the cursor behind it, and `on_record` with each kept record. With
+    Calls `on_frame` with each kept frame and the cursor behind it, and appends each kept record to `records`. With
     `segments`, paths by number in any folders, the scan ends at the first hole without searching for commit frames.
     """
 
@@ -132,13 +136,13 @@ class SegmentScanner:
         recorder: bytes,
         *,
         on_frame: Callable[[ReadCursor, Frame], None] | None = None,
-        on_record: Callable[[Record], None] | None = None,
+        records: list[Record] | None = None,
         segments: Mapping[int, Path] | None = None,
     ) -> None:
         self._folder = folder
         self._recorder = recorder
         self._on_frame = on_frame
-        self._on_record = on_record
+        self._records = records
         self._types: dict[bytes, str] = {}
         self._paths = segments
         self._numbers = segment_numbers(folder) if segments is None else sorted(segments)
@@ -215,46 +219,62 @@ class SegmentScanner:
 
     def _scan_records(self, path: Path, buffer: Buffer, number: int) -> None:
         """Keep a segment's records from the cut to the first hole or damage, and move the cut there."""
-        opened, uncommitted, on_frame, on_record, types = (
-            self._open,
-            self._uncommitted,
-            self._on_frame,
-            self._on_record,
-            self._types,
-        )
         _, offset, position = self._cut
+        salt = salt_of(self._recorder, number)
+        in_steps = core.IS_COMPILED and self._on_frame is None
         try:
-            for frame in decode_each(buffer, offset, salt_of(self._recorder, number)):
-                kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, checksum, size = frame
-                if kind == COMMIT:
-                    self._cut = ReadCursor(number, offset, position)
-                    self._check_commit(path, make(Frame, frame))
-                elif at == position + 1:
-                    type_name = types.get(name)
-                    if type_name is None:
-                        type_name = types[name] = check_type(path, offset, name)
-                    if kind == EVENT:
-                        before = opened.get(episode)
-                        if sequence != (before[0] if before else 0) + 1 and (before or not is_named(episode)):
-                            raise _not_next(path, offset, episode, sequence, before)
-                        opened[episode] = (sequence, wall_ns, monotonic_ns)
-                        if name == _EPISODE_ENDED:
-                            del opened[episode]
+            while True:
+                if in_steps:
+                    until = position + RECORDS_AT_ONCE
+                    offset, position = self._take(buffer, offset, salt, position, until)
+                    if position == until:
+                        continue
+                for frame in decode_each(buffer, offset, salt):
+                    if frame[0] == COMMIT:
+                        self._cut = ReadCursor(number, offset, position)
+                        self._check_commit(path, make(Frame, frame))
+                    elif frame[2] == position + 1:
+                        self._keep(path, offset, frame)
+                        position += 1
                     else:
-                        _check_declaration(path, offset, type_name, payload)
-                    uncommitted.append(checksum)
-                    position = at
-                    if on_record is not None:
-                        owner = episode if kind == EVENT else None
-                        values = (at, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
-                        on_record(make(Record, values))
+                        return
+                    offset += frame[-1]
+                    if self._on_frame is not None:
+                        self._on_frame(ReadCursor(number, offset, position), make(Frame, frame))
+                    if in_steps:
+                        break
                 else:
-                    break
-                offset += size
-                if on_frame is not None:
-                    on_frame(ReadCursor(number, offset, position), make(Frame, frame))
+                    return
         finally:
             self._cut = ReadCursor(number, offset, position)
+
+    def _take(self, buffer: Buffer, offset: int, salt: int, position: int, until: int) -> tuple[int, int]:
+        """Keep the records that need no decision; return offset and position behind them."""
+        limits = (position, until, 0, SEGMENT_BYTES_MAX)
+        kept = (self._types, Record, self._records, self._open, self._uncommitted)
+        offset, position, _ = core.take_records(buffer, offset, salt, *limits, *kept)
+        return offset, position
+
+    def _keep(self, path: Path, offset: int, frame: Fields) -> None:
+        """Keep the next record. Raises `SpoolDamaged` if no recorder writes it."""
+        kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, checksum, _ = frame
+        type_name = self._types.get(name)
+        if type_name is None:
+            type_name = self._types[name] = check_type(path, offset, name)
+        if kind == EVENT:
+            before = self._open.get(episode)
+            if sequence != (before[0] if before else 0) + 1 and (before or not is_named(episode)):
+                raise _not_next(path, offset, episode, sequence, before)
+            self._open[episode] = (sequence, wall_ns, monotonic_ns)
+            if name == _EPISODE_ENDED:
+                del self._open[episode]
+        else:
+            _check_declaration(path, offset, type_name, payload)
+        self._uncommitted.append(checksum)
+        if self._records is not None:
+            owner = episode if kind == EVENT else None
+            values = (at, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
+            self._records.append(make(Record, values))
 
     def _check_commit(self, path: Path, frame: Frame) -> None:
         """Check that the records a commit frame covers are present and unchanged."""
@@ -405,18 +425,34 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
 
     Leaves a damaged folder as it is, because a repair decides about its records.
     """
-    unsynced: list[tuple[ReadCursor, list[str]]] = []  # before a record, and the blobs that it refers to
+    prefix, damage, uncommitted = survey(folder, recorder)
+    if damage is not None or not uncommitted:
+        return
+    for before, frame in _frames_behind(folder, recorder, prefix, prefix.cut.position - len(uncommitted)):
+        references = references_in(frame.type.decode(), frame.payload)
+        if not all(is_whole(folder, each.hash) for each in references):
+            seal(folder, prefix._replace(cut=before))
+            return
 
-    def note(after: ReadCursor, frame: Frame) -> None:
-        if frame.kind == COMMIT:
-            unsynced[:] = [each for each in unsynced if each[0].position >= frame.position]
-        elif references := references_in(frame.type.decode(), frame.payload):
-            before = ReadCursor(after.number, after.offset - frame.size, after.position - 1)
-            unsynced.append((before, [each.hash for each in references]))
 
-    prefix, damage, _ = survey(folder, recorder, on_frame=note)
-    if damage is None:
-        for before, names in unsynced:
-            if not all(is_whole(folder, name) for name in names):
-                seal(folder, prefix._replace(cut=before))
+def _frames_behind(
+    folder: Path, recorder: bytes, prefix: ValidPrefix, position: int
+) -> Iterator[tuple[ReadCursor, Frame]]:
+    """Yield the records of a prefix behind this position, each with the cursor before it."""
+    for number, base in sorted(prefix.bases.items()):
+        if prefix.bases.get(number + 1, prefix.cut.position + 1) <= position + 1:
+            continue
+        path = segment_path(folder, number)
+        buffer, before = read_segment(path), base - 1
+        header = read_header(path, buffer, recorder=recorder, number=number)
+        assert header is not None, "the segment is part of the prefix"
+        offset = header_bytes(len(header.open))
+        for fields in decode_each(buffer, offset, salt_of(recorder, number)):
+            frame = make(Frame, fields)
+            if before == prefix.cut.position:
                 return
+            if frame.kind != COMMIT:
+                if before >= position:
+                    yield ReadCursor(number, offset, before), frame
+                before = frame.position
+            offset += frame.size

@@ -233,7 +233,7 @@ class DeadSource:
         self._ready: list[Record] = []
         """Records scanned but not supplied yet; those beyond position `_confirmed` must wait."""
         self._confirmed = 0
-        self._scanner = SegmentScanner(folder, recorder, on_record=self._ready.append)
+        self._scanner = SegmentScanner(folder, recorder, records=self._ready)
         while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
             pass
         self._released = False

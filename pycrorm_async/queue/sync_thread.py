@@ -19,7 +19,9 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
+from functools import partial
 from queue import Empty, SimpleQueue
+from typing import Final
 
 from pycrorm_async.clock import monotonic_ns
 
@@ -28,9 +30,11 @@ class SyncThread:
     """Takes turns until stopped. `turn` returns the seconds until it wants the next turn, or None."""
 
     def __init__(self, *, name: str, interval_s: float, turn: Callable[[], float | None]) -> None:
-        self._interval_s = interval_s
         self._turn = turn
         self._calls: SimpleQueue[float] = SimpleQueue()  # seconds for which further work may gather
+        self.wake: Final[Callable[[], None]] = partial(self._calls.put, interval_s)
+        """Request a turn within the sync interval. From any thread, at any time; runs no Python, so it is never
+        interrupted."""
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=f"pycrorm sync {name}", daemon=True)
 
@@ -41,10 +45,6 @@ class SyncThread:
     def is_this_thread(self) -> bool:
         """True if the caller runs in this thread; a finalizer here must not wait for this thread's own work."""
         return threading.current_thread() is self._thread
-
-    def wake(self) -> None:
-        """Request a turn within the sync interval. From any thread, at any time."""
-        self._calls.put(self._interval_s)
 
     def call_in(self, seconds: float) -> None:
         """Request a turn within this many seconds."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from hatchling.builders.wheel import WheelBuilder
 
 ROOT = Path(__file__).parent.parent.parent
-CODE = {".py", ".pyc", ".md"}
+CODE = {".py", ".pyc", ".md", ".c", ".so"}
 
 
 def test_the_wheel_has_the_marker_of_its_types_and_every_file_that_the_package_reads(tmp_path: Path) -> None:

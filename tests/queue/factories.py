@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from collections.abc import Callable
+from itertools import repeat
 from pathlib import Path
 
 from pycrorm_async.clock import Clock
@@ -19,7 +20,8 @@ from pycrorm_async.settings import Settings
 
 WALL_NS = 1_700_000_000_123_456_789
 MONOTONIC_NS = 987_654_321
-STILL = Clock(wall_ns=lambda: WALL_NS, monotonic_ns=lambda: MONOTONIC_NS)
+STILL = Clock(wall_ns=repeat(WALL_NS).__next__, monotonic_ns=repeat(MONOTONIC_NS).__next__)
+"""A frozen clock in C, so that the compiled core appends with it too."""
 
 SMALL = Settings(
     sync_interval_ms=5,
@@ -117,7 +119,9 @@ class FolderWriter:
     of each.
     """
 
-    def __init__(self, spool: Path, *, settings: Settings = SMALL, recorder: EpisodeId = RECORDER) -> None:
+    def __init__(
+        self, spool: Path, *, settings: Settings = SMALL, recorder: EpisodeId = RECORDER, clock: Clock = STILL
+    ) -> None:
         self.folder = spool / episode_text(recorder)
         self.folder.mkdir(parents=True)
         (self.folder / "alive").touch()
@@ -125,7 +129,7 @@ class FolderWriter:
             folder=self.folder,
             recorder=recorder,
             capacity=Capacity.of(settings),
-            clock=STILL,
+            clock=clock,
             wake=lambda: None,
             hurry=lambda: None,
             make_room=lambda _: False,

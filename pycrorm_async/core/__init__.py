@@ -1,0 +1,95 @@
+"""Choose the compiled core, where it is built, or the Python code beside it, which does the same and is the reference.
+
+`_core.c` appends records to a mapped segment and reads them back; `build.py` compiles it when the package is installed.
+Each function here does the cases that need no decision, as many as it can, and returns; the caller does the others. The
+functions of the Python core do none. So the callers hold the rules once, and run the same with both.
+
+`PYCRORM_PURE=1` chooses Python. So does a Python without the interpreter lock, which the compiled core relies on.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from types import BuiltinMethodType, MethodWrapperType, ModuleType
+from typing import TYPE_CHECKING, Any, Final
+
+
+def _load() -> tuple[ModuleType | None, str]:
+    """Return the compiled core, or None and the reason."""
+    if os.environ.get("PYCRORM_PURE", "0") not in ("", "0"):
+        return None, "PYCRORM_PURE is set"
+    if "t" in sys.abiflags:
+        return None, "this Python runs without the interpreter lock"
+    try:
+        return importlib.import_module(f"{__name__}._core"), ""
+    except ImportError as error:
+        return None, str(error) if hasattr(error, "path") and error.path else "it was installed without a C compiler"
+
+
+_compiled, PURE_REASON = _load()
+IS_COMPILED: Final = _compiled is not None
+
+
+ATOMIC: Final = (BuiltinMethodType, MethodWrapperType)
+"""Types of callables that run no Python, so that no signal handler, finalizer or other thread runs meanwhile."""
+
+
+def description() -> str:
+    """State in one sentence which core runs, and why it is not the compiled one."""
+    if IS_COMPILED:
+        return "This installation records and reads with the compiled core."
+    return f"This installation records and reads with Python alone, which takes longer for each event: {PURE_REASON}."
+
+
+class PythonTail:
+    """The end of the records in the current segment, and what an append needs.
+
+    Attributes:
+        open: the open episodes; the sequence, wall time and monotonic time of the last record of each.
+        position: of the last record.
+        owner: the id of the thread that changes this state in several steps; 0 while no thread does.
+        _has_atomic_clock: whether the clocks run no Python, as the system's; an append may be interrupted in others.
+    """
+
+    open: dict[Any, tuple[int, int, int]]
+    position: int
+    owner: int = 0
+    _buffer: Any  # the mapping of the current segment; None when it is closed
+    _offset: int
+    _end: int
+    _ordinary_end: int
+    _salt: int
+    _span_count: int
+    _span_checksum: int
+    _events_max: int
+    _quiet: bool
+    _wall_ns: Callable[[], int]
+    _monotonic_ns: Callable[[], int]
+    _has_atomic_clock: bool
+    _refusal: Callable[[], Exception] | None
+    _wake: Callable[[], None]
+
+    def append(self, heading: tuple[Any, str, int], payload: bytes, reserved: bool) -> int | None:  # noqa: ARG002, FBT001
+        """Append an event of an open episode that fits; return its sequence, or None if another case applies."""
+        return None
+
+
+def _take_nothing(*arguments: Any) -> tuple[int, int, int]:
+    return arguments[1], arguments[3], arguments[5]
+
+
+if TYPE_CHECKING:
+    Tail = PythonTail
+else:
+    Tail = getattr(_compiled, "Tail", PythonTail)
+
+take_records: Final[Callable[..., tuple[int, int, int]]] = getattr(_compiled, "take_records", _take_nothing)
+"""Append records to a list, up to the first frame that needs a decision; return offset, position and total behind them.
+
+The arguments are the buffer, the offset, the segment's salt, the position of the record before, the last position, the
+bytes of the payloads so far and at most, the names of event types by their bytes, the class `Record`, the list or None;
+and for a scan, else None: the open episodes, which the call updates, and a list to which it appends the checksums.
+"""

@@ -1,0 +1,409 @@
+"""The compiled core writes the bytes that Python writes, and reads what Python reads."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import os
+import random
+import subprocess
+import sys
+import threading
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pycrorm_async import core
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.core.build import NotCompiled, compile_core
+from pycrorm_async.errors import PycrormError, SpoolDamaged
+from pycrorm_async.events.codec import Heading, Record
+from pycrorm_async.queue.appender import Appender
+from pycrorm_async.queue.format import (
+    ReadCursor,
+    Reader,
+    ReadPlace,
+    SegmentHeader,
+    decode_each,
+    decode_header,
+    header_bytes,
+    salt_of,
+)
+from pycrorm_async.queue.scan import SegmentScanner
+from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, ended, episode, node, started
+
+ROOT = Path(__file__).parent.parent.parent
+compiled = pytest.mark.skipif(not core.IS_COMPILED, reason=f"the core is not compiled: {core.PURE_REASON}")
+
+
+def c_core() -> Any:
+    return importlib.import_module("pycrorm_async.core._core")
+
+
+@contextmanager
+def python_alone() -> Iterator[None]:
+    """Let readers and scanners use Python alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(core, "take_records", core._take_nothing)
+        patch.setattr(core, "IS_COMPILED", False)
+        yield
+
+
+# === crc32 ====================================================================================================
+
+
+@compiled
+@pytest.mark.parametrize("folds", [True, False], ids=["folded", "by tables"])
+def test_the_checksum_is_that_of_zlib_for_every_size_and_alignment(folds: bool) -> None:
+    content = random.Random(7).randbytes(4_200)
+    for size in (*range(600), 1023, 1024, 1025, 4096):
+        part = content[size % 17 : size % 17 + size]
+        assert c_core().crc32(part, folds) == zlib.crc32(part), size
+
+
+# === appending ================================================================================================
+
+
+class Step(NamedTuple):
+    """A record to put, with the size of its payload, or a sync."""
+
+    heading: Heading | None
+    size: int = 0
+    reserved: bool = True
+
+
+nodes = st.builds(
+    lambda number, name: Heading(episode(number), name, 1),
+    st.integers(1, 3),
+    st.sampled_from(["NodeStarted", "NodeEnded", "x", "ä" * 127, "x" * 255, "EpisodeTagged"]),
+)
+headings = st.one_of(
+    nodes, nodes, nodes, st.builds(started, st.integers(1, 3)), st.builds(ended, st.integers(1, 3)), st.just(DECLARED)
+)
+steps = st.one_of(
+    st.builds(Step, headings, st.one_of(st.integers(0, 70), st.integers(0, 2_100)), st.booleans()),
+    st.just(Step(None)),
+)
+
+
+def written_by(spool: Path, steps: list[Step], clock: Clock) -> tuple[list[bytes], list[object]]:
+    """Take the steps; return the content of each segment and the outcome of each step."""
+    author = FolderWriter(spool, clock=clock)
+    outcomes: list[object] = []
+    for heading, size, reserved in steps:
+        if heading is None:
+            author.sync()
+            continue
+        try:
+            outcomes.append(author.appender.put(heading, b"%d" % size * size if size else b"", reserved))
+        except PycrormError as error:
+            outcomes.append(repr(error).replace(str(spool), ""))
+    last = [sequence for sequence, _, _ in author.appender.open.values()]
+    outcomes += [author.appender.position, author.appender._span_checksum, author.end, last]
+    author.appender.close()
+    return [path.read_bytes() for path in author.segments], outcomes
+
+
+def times_of(segments: list[bytes]) -> tuple[list[int], list[int]]:
+    """Return the wall times and the monotonic times of all frames, in order."""
+    walls, monotonics = [], []
+    for number, content in enumerate(segments, 1):
+        header = decode_header(content)
+        assert isinstance(header, SegmentHeader)
+        for frame in decode_each(content, header_bytes(len(header.open)), salt_of(RECORDER, number)):
+            walls.append(frame[4])
+            monotonics.append(frame[5])
+    return walls, monotonics
+
+
+@compiled
+@given(st.lists(steps, max_size=60))
+def test_both_cores_write_the_same_segments_and_refuse_the_same(tmp_path_factory: Any, steps: list[Step]) -> None:
+    """Python repeats the times that the system's clock gave the compiled core."""
+    folder = tmp_path_factory.mktemp("cores")
+    steps = [Step(started(1)), *steps]
+    segments, outcomes = written_by(folder / "compiled", steps, SYSTEM_CLOCK)
+    walls, monotonics = map(iter, times_of(segments))
+    replayed = Clock(lambda: next(walls), lambda: next(monotonics))
+    assert written_by(folder / "python", steps, replayed) == (segments, outcomes)
+
+
+@compiled
+def test_the_compiled_core_appends_all_that_needs_no_decision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decided: list[str] = []
+    put = Appender._put
+
+    def watched(appender: Appender, heading: Heading, *others: Any) -> int:
+        decided.append(heading.type)
+        return put(appender, heading, *others)
+
+    monkeypatch.setattr(Appender, "_put", watched)
+    author = FolderWriter(tmp_path)
+    for heading in (started(), node(), DECLARED, node(), node(), ended()):
+        author.put(heading)
+    assert decided == ["EpisodeStarted", "DesignatorTypeDeclared", "EpisodeEnded"]
+    author.appender.close()
+
+
+@compiled
+def test_a_sync_that_begins_while_it_is_woken_hears_of_the_next_record(tmp_path: Path) -> None:
+    """A caller of `wake` may lose the interpreter lock there, and the sync thread take the span."""
+    author = FolderWriter(tmp_path)
+    author.put(started())
+    woken: list[int] = []
+
+    def wake() -> None:
+        woken.append(author.appender.begin_sync().position)
+
+    author.appender._wake = wake
+    author.appender._quiet = True
+    author.put(node())
+    author.put(node())
+    assert woken == [2, 3]
+    author.appender.close()
+
+
+def test_a_record_whose_wake_was_interrupted_is_written_and_the_next_one_wakes(tmp_path: Path) -> None:
+    author = FolderWriter(tmp_path)
+    author.put(started())
+    author.sync()
+    woken: list[bool] = []
+
+    def interrupted() -> None:
+        woken.append(True)
+        raise KeyboardInterrupt
+
+    author.appender._wake = interrupted
+    for position in (2, 3):
+        with pytest.raises(KeyboardInterrupt):
+            author.appender.put(node(), b"{}", True)
+        assert author.appender.position == position
+    assert len(woken) == 2
+    author.appender.close()
+
+
+def test_no_record_is_put_while_another_thread_changes_the_state(tmp_path: Path) -> None:
+    author = FolderWriter(tmp_path)
+    author.put(started())
+    thread = threading.Thread(target=lambda: author.appender.put(node(), b"{}", True))
+
+    def change() -> int:
+        thread.start()
+        thread.join(0.2)
+        return author.appender.position
+
+    assert author.appender._gc_lock.run(change) == 1
+    thread.join()
+    assert author.appender.position == 2
+    author.appender.close()
+
+
+def test_the_mapping_is_released_before_it_is_closed(tmp_path: Path) -> None:
+    author = FolderWriter(tmp_path)
+    author.put(started())
+    buffer = author.appender._buffer
+    author.appender.close()
+    assert buffer.closed
+    assert author.appender._buffer is None
+    with pytest.raises((TypeError, ValueError)):
+        author.appender.put(node(), b"{}", True)
+
+
+@compiled
+def test_arguments_of_other_types_are_left_to_python(tmp_path: Path) -> None:
+    """Each of these would be refused there, or is not what a recorder puts."""
+    author = FolderWriter(tmp_path)
+    author.put(started())
+    mine = started().episode
+    append: Callable[..., int | None] = author.appender.append
+    for heading, payload in (
+        (Heading(mine, "\ud800", 1), b"{}"),
+        (Heading(mine, "", 1), b"{}"),
+        (Heading(mine, "x" * 256, 1), b"{}"),
+        (Heading(mine, "x", 2**16), b"{}"),
+        (Heading(mine, "x", -1), b"{}"),
+        (Heading(mine, "x", 2**70), b"{}"),
+        ([mine, "x", 1], b"{}"),
+        ((mine, "x"), b"{}"),
+        (Heading(mine, "x", 1), bytearray(b"{}")),
+        ((b"short", "x", 1), b"{}"),
+    ):
+        assert append(heading, payload, True) is None
+    assert author.appender.position == 1
+    with pytest.raises(TypeError):
+        append()
+    assert append(Heading(mine, "x", 2**16 - 1), b"{}", True) == 2
+    author.appender.close()
+
+
+# === reading ==================================================================================================
+
+
+def outcome_of(folder: Path, last: int) -> tuple[object, ...]:
+    """Read a folder with a reader and with a scan; return all that they return and raise."""
+    reader = Reader(ReadPlace(folder, RECORDER, ReadCursor(1, header_bytes(0), 0)))
+    records: list[Record] = []
+    results: list[object] = []
+    try:
+        while reader.cursor.position < last:
+            batch = reader.read(last=last, events_max=3, bytes_max=40)
+            reader.cursor = batch.after
+            results.append(batch)
+    except (SpoolDamaged, OSError) as error:
+        results.append(repr(error))
+    finally:
+        reader.close()
+    scanner = SegmentScanner(folder, RECORDER, records=records)
+    try:
+        while scanner.step():
+            pass
+    except PycrormError as error:
+        results.append(repr(error))
+    return (*results, records, scanner.prefix, scanner.uncommitted, scanner.confirmed)
+
+
+@pytest.fixture
+def author(tmp_path: Path) -> FolderWriter:
+    return FolderWriter(tmp_path)
+
+
+@pytest.fixture
+def two_segments(tmp_path: Path) -> FolderWriter:
+    """Two episodes, a declaration, an end, commit frames, and unsynced records behind them."""
+    author = FolderWriter(tmp_path, settings=replace(SMALL, segment_bytes=1272, record_bytes_max=100))
+    for heading in (started(1), node(1), DECLARED, started(2)):
+        author.put(heading, b"1")
+    author.sync()
+    for heading in (node(2), node(1), node(2), ended(2), node(1), node(1)):
+        author.put(heading, b"23")
+    author.sync()
+    for _ in range(3):
+        author.put(node(1), b"456")
+    author.appender.close()
+    assert len(author.segments) == 2
+    return author
+
+
+@compiled
+@pytest.mark.slow
+def test_every_flipped_bit_of_a_segment_is_read_alike(author: FolderWriter) -> None:
+    for heading in (started(), node()):
+        author.put(heading, b"1")
+    author.sync()
+    author.put(node(), b"23")
+    author.appender.close()
+    [path] = author.segments
+    content = path.read_bytes()[: author.end + 8]
+    for byte in range(len(content)):
+        for bit in range(8):
+            path.write_bytes(content[:byte] + bytes([content[byte] ^ 1 << bit]) + content[byte + 1 :])
+            outcome = outcome_of(author.folder, 3)
+            with python_alone():
+                assert outcome_of(author.folder, 3) == outcome, (byte, bit)
+
+
+@compiled
+@pytest.mark.slow
+def test_every_torn_byte_of_a_folder_is_read_alike(two_segments: FolderWriter) -> None:
+    for path in two_segments.segments:
+        content = path.read_bytes()
+        for size in range(len(content.rstrip(b"\0")) + 1):
+            path.write_bytes(content[:size] + bytes(len(content) - size if size % 2 else 0))
+            outcome = outcome_of(two_segments.folder, len(two_segments.records))
+            with python_alone():
+                assert outcome_of(two_segments.folder, len(two_segments.records)) == outcome, (path.name, size)
+        path.write_bytes(content)
+
+
+@compiled
+def test_whole_folders_are_read_alike_and_by_the_compiled_core(two_segments: FolderWriter) -> None:
+    outcome = outcome_of(two_segments.folder, len(two_segments.records))
+    records = [each for batch in outcome[:-4] for each in batch.records]  # type: ignore[attr-defined]
+    assert records == two_segments.records[: len(records)]
+    assert outcome[-4] == two_segments.records
+    with python_alone():
+        assert outcome_of(two_segments.folder, len(two_segments.records)) == outcome
+
+
+# === building =================================================================================================
+
+
+def installed(folder: Path, program: str, **environment: str) -> str:
+    """Unpack a new wheel into `folder`, run a program with it, and return its output."""
+    [wheel] = WheelBuilder(str(ROOT)).build(directory=str(folder / "dist"), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    program = f"import sys; sys.path.insert(0, 'site')\n{program}"
+    command, variables = [sys.executable, "-c", program], {**os.environ, **environment}
+    done = subprocess.run(command, env=variables, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return f"{Path(wheel).name} {done.stdout}"
+
+
+RECORD = """
+import asyncio, logging, pathlib, sys
+logging.basicConfig(level=logging.INFO, format="logged: %(message)s", stream=sys.stdout)
+from pycrorm_async import core
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.events.codec import Heading
+from pycrorm_async.events.ids import episode_id
+from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.settings import Settings
+one, spool, clock = episode_id(1, b"an episode"), pathlib.Path("spool"), SYSTEM_CLOCK
+for name in (b"recorder..", b"another..."):
+    queue = RecorderQueue.create(spool, settings=Settings(), clock=clock, recorder=episode_id(1, name))
+    assert [queue.put_nowait(Heading(one, each, 1), b"{}") for each in ("EpisodeStarted", "NodeStarted")] == [1, 2]
+    asyncio.run(queue.synced_to())
+    records = asyncio.run(queue.get_batch(events_max=9, bytes_max=999, age_s_max=0.0))
+    assert [each.sequence for each in records] == [1, 2]
+    queue.release()
+print(core.IS_COMPILED, core.description())
+"""
+
+
+@compiled
+@pytest.mark.slow
+def test_a_wheel_has_the_compiled_core_and_an_environment_variable_turns_it_off(tmp_path: Path) -> None:
+    said = installed(tmp_path / "compiled", RECORD)
+    assert "-cp311-abi3-linux_" in said
+    assert "True This installation records and reads with the compiled core." in said
+    assert "logged" not in said
+    python = installed(tmp_path / "python", RECORD, PYCRORM_PURE="1")
+    assert "False This installation records and reads with Python alone" in python
+    assert "PYCRORM_PURE is set" in python
+
+
+@pytest.mark.slow
+def test_without_a_compiler_the_package_is_installed_runs_and_says_so_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    said = installed(tmp_path, RECORD)
+    assert "-py3-none-any.whl" in said
+    assert "it was installed without a C compiler" in said
+    assert said.count("logged: This installation records and reads with Python alone") == 1
+
+
+def test_a_compiler_that_fails_is_reported_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = tmp_path / "core.c"
+    source.write_text("#error no\n")
+    monkeypatch.delenv("PYCRORM_PURE", raising=False)
+    with pytest.raises(NotCompiled, match=r"error: #error no|there is no C compiler"):
+        compile_core(source, tmp_path / "core.so")
+    assert list(tmp_path.iterdir()) == [source]
+
+
+@compiled
+def test_the_compiled_core_that_these_tests_load_is_that_of_the_source() -> None:
+    source = (ROOT / "pycrorm_async/core/_core.c").read_bytes()
+    assert hashlib.sha256(source).hexdigest() == c_core().SOURCE, "run `python -m pycrorm_async.core.build`"
