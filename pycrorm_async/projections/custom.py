@@ -32,7 +32,7 @@ import re
 import sys
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
@@ -52,7 +52,7 @@ from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, Happening, NodeStarted
 from pycrorm_async.projections import pipeline as checkpoints
 from pycrorm_async.projections.columns import OWN, Layout, Storage, column_type, next_number, physical_name
-from pycrorm_async.projections.fold import happening_of, stored_rows
+from pycrorm_async.projections.fold import decode_events, stored_rows
 from pycrorm_async.projections.generations import (
     PROJECTION,
     Generation,
@@ -366,13 +366,24 @@ class _OpenFold:
 class EpisodeFolds:
     """The folds of the open episodes of one projection in this process."""
 
-    def __init__(self, projection: EpisodeProjection) -> None:
-        self.projection = projection
+    def __init__(self, projection: Projection) -> None:
+        self._projection = projection
         self._open: OrderedDict[int, _OpenFold] = OrderedDict()
 
-    def take(self, number: int) -> _OpenFold | None:
-        """Return the fold of this episode and remove it; None if there is none."""
-        return self._open.pop(number, None)
+    def has(self, span: Span) -> bool:
+        """Return whether the fold of the episode has come to the beginning of this span."""
+        fold = self._open.get(span.number)
+        return span.after == (fold.reached if fold is not None else 0)
+
+    def take(self, number: int, after: int) -> _OpenFold:
+        """Return the fold of this episode, which is not beyond event `after`, and remove it.
+
+        A fold without a state has always read the events up to `after`.
+        """
+        fold = self._open.pop(number, None)
+        if not isinstance(self._projection, EpisodeProjection):
+            return _OpenFold(self._projection.fold, after)
+        return fold if fold is not None and fold.reached <= after else _OpenFold(self._projection.episode())
 
     def keep(self, number: int, fold: _OpenFold) -> None:
         """Keep the fold of an episode that has not ended, and drop the one that was not folded for the longest time.
@@ -425,7 +436,10 @@ class ProjectedBatch(ABC):
     Args:
         projection: to fold with.
         declared: designator types by fingerprint.
-        folds: of an `EpisodeProjection`, those of the episodes that earlier batches began; None for other projections.
+        folds: those of the episodes that earlier batches began.
+
+    Attributes:
+        reads: the names of the types of events that the projection reads; None: all types.
     """
 
     def __init__(
@@ -437,32 +451,33 @@ class ProjectedBatch(ABC):
         self._projection = projection
         self._declared = declared
         reads = projection.reads
-        self._reads = None if reads is None else frozenset(each.__name__ for each in reads)
-        self._folds = folds
+        self.reads = None if reads is None else frozenset(each.__name__ for each in reads)
+        self._folds = EpisodeFolds(projection) if folds is None else folds
         self._taken: dict[int, _OpenFold] = {}
 
+    def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
+        return [each for each in spans if self._folds.has(each)]
+
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Bring the fold of each episode that has a state to the event before its span."""
-        if (folds := self._folds) is None:
-            return
+        """Bring the fold of each episode to the event before its span."""
         for span in spans:
-            fold = folds.take(span.number)
-            if fold is None or fold.reached > span.after:
-                fold = _OpenFold(folds.projection.episode())
-            self._taken[span.number] = fold
+            fold = self._taken[span.number] = self._folds.take(span.number, span.after)
             while fold.reached < span.after and fold.fault is None:
                 page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
                 fold.fault = self._read_again(fold, await log.spans([page]), page.last)
 
-    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
+    def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
         """Give the next events of an episode to its fold, which is dropped if it cannot fold one; see `Batch.fold`."""
-        first, folds = events[0], self._folds
+        first = events[0]
         fold = self._taken.get(first.number)
         if fold is None:
-            assert folds is None or first.sequence == 1, "a batch that continues an episode restores its fold first"
-            fold = _OpenFold(self._projection.fold if folds is None else folds.projection.episode())
-            self._taken[first.number] = fold
-        refused = self._read(fold.fold, events) if fold.fault is None else (first.sequence, CannotFold(fold.fault))
+            assert first.sequence == 1, "a batch that continues an episode restores its fold first"
+            fold = self._taken[first.number] = self._folds.take(first.number, 0)
+        refused = (
+            self._read(fold.fold, events, happenings)
+            if fold.fault is None
+            else (first.sequence, CannotFold(fold.fault))
+        )
         if refused is None:
             fold.advance(events)
             return None
@@ -474,7 +489,11 @@ class ProjectedBatch(ABC):
     def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
         """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
         whole = consecutive(events, fold.reached)
-        if whole and (refused := self._read(fold.fold, whole, kept=False)) is not None:
+        happenings, undecodable = decode_events(whole, self.reads)
+        refused = self._read(fold.fold, whole[: len(happenings)], happenings, kept=False)
+        if refused is None and undecodable is not None:
+            refused = whole[len(happenings)].sequence, undecodable
+        if refused is not None:
             sequence, fault = refused
             raised = "" if isinstance(fault, CannotFold) else f"{type(fault).__name__}: "
             return f"event {sequence}, read again: {raised}{fault}"
@@ -482,12 +501,18 @@ class ProjectedBatch(ABC):
             fold.advance(whole)
         return None if fold.reached == last else f"event {fold.reached + 1} is missing in the log"
 
-    def _read(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None:
-        reads = self._reads
-        return self.add(fold, events if reads is None else [each for each in events if each.type in reads], kept=kept)
+    def _read(
+        self, fold: Any, events: Sequence[StoredEvent], happenings: Sequence[Happening | None], *, kept: bool = True
+    ) -> Refused | None:
+        reads, decoded = self.reads, zip(events, happenings, strict=True)
+        return self.add(
+            fold,
+            ((event, each) for event, each in decoded if each is not None and (reads is None or event.type in reads)),
+            kept=kept,
+        )
 
     @abstractmethod
-    def add(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+    def add(self, fold: Any, events: Iterable[tuple[StoredEvent, Happening]], *, kept: bool) -> Refused | None:
         """Fold events of an episode, and add the results to the batch, or discard them if `kept` is False.
 
         Returns the sequence of the first event that cannot be folded, with the exception; its results are not added.
@@ -495,9 +520,8 @@ class ProjectedBatch(ABC):
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:  # noqa: ARG002 - for subclasses
         """Leave the folds of the episodes to the next batch. Subclasses prepare their statements, too."""
-        if self._folds is not None:
-            while self._taken:
-                self._folds.keep(*self._taken.popitem())
+        while self._taken:
+            self._folds.keep(*self._taken.popitem())
 
     @abstractmethod
     async def write(self, connection: AsyncConnection, generation: int) -> None:
@@ -530,17 +554,17 @@ class CustomRows(ProjectedBatch):
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
 
-    def add(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+    def add(self, fold: EpisodeFold, events: Iterable[tuple[StoredEvent, Happening]], *, kept: bool) -> Refused | None:
         """Add the changes of rows that a fold makes of events, if both databases store their values alike.
 
         With `kept` False the fold only reads the events, to restore its state: their rows are in the tables already.
         Returns None, or the sequence of the first event that could not be folded, with the exception; none of the
         changes of that event are added then, and its episode is parked.
         """
-        for event in events:
+        for event, happening in events:
             changes = Changes()
             try:
-                fold(self._event(event), changes)
+                fold(self._event(event, happening), changes)
                 if kept and changes.all:
                     self._add(event.number, changes.all)
             except Exception as fault:  # noqa: BLE001 - user code; the reason parks the episode
@@ -597,9 +621,8 @@ class CustomRows(ProjectedBatch):
                 }
                 await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, changed)
 
-    def _event(self, stored: StoredEvent) -> Event:
+    def _event(self, stored: StoredEvent, happening: Happening) -> Event:
         number, sequence, _, _, wall_ns, monotonic_ns, payload = stored
-        happening = happening_of(stored)
         parameters: Mapping[str, Any] = {}
         dtype = declaration = None
         if isinstance(happening, NodeStarted) and happening.designator is not None:
@@ -669,7 +692,7 @@ _SCAN_S_MAX = 10.0
 
 def learner_of(projection: Projection) -> Learn:
     """Return the function that learns to fold into the tables of a projection."""
-    folds = EpisodeFolds(projection) if isinstance(projection, EpisodeProjection) else None
+    folds = EpisodeFolds(projection)
 
     def learn(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         declared = {}
@@ -679,7 +702,6 @@ def learner_of(projection: Projection) -> Learn:
             except ValueError:  # from a newer version: its nodes cannot be folded
                 continue
         if isinstance(projection, PackedProjection):
-            assert folds is not None, "it is an EpisodeProjection"
             return layout, partial(projection.batch, declared, folds)
         return layout, partial(CustomRows, projection, declared, folds)
 
@@ -814,6 +836,15 @@ class CustomTables:
             runner = FoldRunner(target, learner_of(each), batch_events=batch_events)
             self._folds.append(_CustomFold(each, target, runner))
         return changed
+
+    def companions(self, events: int, *, until_visible: bool) -> list[FoldRunner]:
+        """Return the folds that take part in a batch of the tables with this number of events.
+
+        The package's own projections take part in large batches, and where a caller waits for all; see
+        `fold_next_batch`.
+        """
+        packed = until_visible or events >= LOOKAHEAD_EVENTS_MIN
+        return [each.runner for each in self._folds if packed or not each.projection.is_packed]
 
     async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
         """Fold a batch of each projection; return False if none was behind.

@@ -12,6 +12,7 @@ from sqlalchemy import ColumnElement, Table, column, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_id_min, row_key
+from pycrorm_async.events.types import Happening
 from pycrorm_async.projections.columns import CORE, LINK_BOX, OF_NO_EPISODE, Storage, leaf_columns, make_table
 from pycrorm_async.projections.generations import Generation
 from pycrorm_async.projections.row_batch import Row
@@ -320,8 +321,11 @@ class TableCheck(Protocol):
         """Begin with these episodes, all of this range, in a snapshot; return False if a table is missing."""
         ...
 
-    def read(self, span: Span, events: Sequence[StoredEvent]) -> None:
-        """Fold the next events of an episode; `events` lacks those that the log lacks."""
+    def read(self, span: Span, events: Sequence[StoredEvent], happenings: Sequence[Happening | Exception], /) -> None:
+        """Fold the next events of an episode, given with their decoded payloads, or why one cannot be decoded.
+
+        `events` lacks those that the log lacks.
+        """
         ...
 
     def lose(self, number: int, sequence: int) -> None:

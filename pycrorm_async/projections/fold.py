@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import ParseError, fromstring
 
@@ -96,14 +96,8 @@ class UndecodablePayload(CannotFold):
     """The payload does not decode as its own type and version, so the log is damaged."""
 
 
-def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
-    """Add the rows of this event to `rows`. Raises `CannotFold`, and then has added none."""
-    happening = happening_of(event)
-    _FOLDS[event.type](event, happening, designators, rows)
-
-
 def fold_happening(event: StoredEvent, happening: Happening, designators: Designators, rows: Rows) -> None:
-    """Add the rows of an event whose payload is decoded already; as `fold`."""
+    """Add the rows of an event and its decoded payload to `rows`. Raises `CannotFold`, and then has added none."""
     _FOLDS[event.type](event, happening, designators, rows)
 
 
@@ -115,6 +109,23 @@ def happening_of(event: StoredEvent) -> Happening:
         raise CannotFold(str(reason)) from None
     except msgspec.DecodeError as error:
         raise UndecodablePayload(f"{event.type} cannot be decoded: {error}") from None
+
+
+def decode_events(
+    events: Iterable[StoredEvent], reads: Collection[str] | None = None
+) -> tuple[list[Happening | None], CannotFold | None]:
+    """Decode payloads up to the first that cannot be decoded; return them with the reason why that one cannot be.
+
+    With `reads`, those of events of other types are None.
+    """
+    happenings: list[Happening | None] = []
+    try:
+        for event in events:
+            happening = happening_of(event) if reads is None or event.type in reads else None
+            happenings.append(happening)
+    except CannotFold as reason:
+        return happenings, reason
+    return happenings, None
 
 
 # --- episodes -------------------------------------------------------------------------------------------------
@@ -506,11 +517,16 @@ def name_episodes(rows: Rows, uuids: Mapping[int, str]) -> None:
 class TableRows:
     """The rows of a batch of events in the built-in tables. Implements `Batch`."""
 
+    reads: frozenset[str] | None = None
+
     def __init__(self, designators: Designators) -> None:
         self._designators = designators
         self._rows = Rows()
         self._uuids: dict[int, str] = {}
         self._insertion: Insertion = None
+
+    def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
+        return spans
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
         """Read the UUIDs of the episodes that start in these spans. The caller may hold the write lock of SQLite."""
@@ -519,11 +535,11 @@ class TableRows:
             async with log.reading() as connection:
                 self._uuids = await uuids_of(connection, starting)
 
-    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
+    def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
         designators, rows = self._designators, self._rows
-        for event in events:
+        for event, happening in zip(events, happenings, strict=True):
             try:
-                fold(event, designators, rows)
+                _FOLDS[event.type](event, happening, designators, rows)
             except CannotFold as reason:
                 return event.sequence, str(reason)
         return None

@@ -71,8 +71,9 @@ PROJECTION = "projection/"
 
 _log = logging.getLogger("pycrorm_async.projections")
 
-Hold: TypeAlias = Literal["share", "change"]
-"""Lock the generation's row until the transaction ends: `share` against changes, `change` against sharers too."""
+Hold: TypeAlias = Literal["share", "change", "if free"]
+"""Lock the generation's row until the transaction ends: `share` against changes, `change` against sharers too. `if
+free` shares a row that no other transaction changes, and finds none otherwise; it never waits."""
 
 _NOTES = "pycrorm_generation"
 _CREATE = f"""
@@ -142,7 +143,7 @@ async def read_generation(connection: AsyncConnection, name: str, *, hold: Hold 
         return None
     query = select(_notes).where(_notes.c.projection == name)
     if hold is not None:  # SQLite has no row locks and needs none: its write transaction excludes all others
-        query = query.with_for_update(read=hold == "share")
+        query = query.with_for_update(read=hold != "change", skip_locked=hold == "if free")
     row = (await connection.execute(query)).first()
     return None if row is None else _generation(row)
 

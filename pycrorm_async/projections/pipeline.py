@@ -17,6 +17,15 @@ before it are written, later ones are not folded, and all other episodes continu
 batch is written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
 A parked episode stays so until the tables are rebuilt.
 
+**Companions.** A runner may have companions: the runners of custom projections, whose targets have checkpoints of their
+own. A batch of the runner then folds each event for all of them, so that it is read and decoded once, and writes their
+rows and checkpoints in its transaction, each companion's behind a savepoint. A companion takes part with those episodes
+that its own last batch left where this one begins. If it cannot be written, because its checkpoint has moved, its
+tables were replaced or locked, or the database refuses a row, the savepoint is rolled back and the batch is written
+without it. The companion is then behind, and folds these events with a batch of its own, as it folds all that it lacks
+for another reason. So a fault in a companion never concerns the tables, and the order in which two processes lock the
+rows of generations does not matter, because a companion's are taken only if no other transaction has them.
+
 **Workers.** A `BatchWorker` folds one batch at a time into the target's tables: the runner itself, or a process of its
 own. The runner chooses the events of each batch. It prepares at most one batch ahead, and writes a prepared batch only
 if the batch before it was written whole; otherwise it discards the prepared one and reads the checkpoints again. A
@@ -34,6 +43,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from operator import attrgetter
 from typing import Final, NamedTuple, Protocol, TypeAlias
@@ -41,10 +51,11 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 from sqlalchemy import TableClause, column, or_, select, table, text, update
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged, PycrormError
+from pycrorm_async.events.types import Happening
 from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import Layout, Storage, physical_name, unite
-from pycrorm_async.projections.fold import TableRows
+from pycrorm_async.projections.fold import TableRows, decode_events
 from pycrorm_async.projections.generations import grow
 from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
@@ -90,14 +101,26 @@ class BatchWorker(Protocol):
 
 
 class Batch(Protocol):
-    """The rows of a batch of events."""
+    """The rows of a batch of events.
+
+    Attributes:
+        reads: the types of the events that it folds; None: all types.
+    """
+
+    reads: frozenset[str] | None
+
+    def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
+        """Return those of these spans before which `restore` needs to read no event."""
+        ...
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
         """Prepare for folding these spans, by reading the facts that the fold needs of the events before them."""
         ...
 
-    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
-        """Add the rows of consecutive events of an episode, at least one.
+    def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
+        """Add the rows of consecutive events of an episode, at least one; `happenings` are their decoded payloads.
+
+        Events of types that are not in `reads` may have no happening.
 
         Returns the first event that cannot be folded, with the reason; of it and those behind it, no row is added.
         """
@@ -132,26 +155,56 @@ class _Types(NamedTuple):
     batch: Callable[[], Batch]
 
 
-class _PreparedBatch(NamedTuple):
+@dataclass(slots=True)
+class _PreparedBatch:
     """A batch between `prepare` and `write`.
 
     Attributes:
+        runner: the owner.
         rows: for the generation `number`.
-        steps: (episode, folded before, folded now) for each episode.
+        reached: by episode number, the last sequence folded.
         parked: the reasons of the episodes to park.
+        beside: the batches of companions.
     """
 
+    runner: FoldRunner
     spans: Sequence[Span]
     types: _Types
     rows: Batch
     number: int
-    steps: list[Progress]
-    parked: dict[int, str]
+    reached: dict[int, int]
+    parked: dict[int, str] = field(default_factory=dict)
+    beside: list[_PreparedBatch] = field(default_factory=list)
+
+    @property
+    def steps(self) -> list[Progress]:
+        """(episode, folded before, folded now) for each episode."""
+        return [(each.number, each.after, self.reached[each.number]) for each in self.spans]
 
     @property
     def events(self) -> int:
         """The number of its folded events."""
         return sum(now - before for _, before, now in self.steps)
+
+    @property
+    def reads(self) -> frozenset[str] | None:
+        """The types of the events that it folds, or a companion; None: all types."""
+        reads = [each.rows.reads for each in (self, *self.beside)]
+        return None if None in reads else frozenset().union(*(each for each in reads if each is not None))
+
+    def add(self, number: int, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> None:
+        """Fold the next events of an episode, unless it is not in the batch, or is parked."""
+        if number not in self.reached or number in self.parked:
+            return
+        if (refused := self.rows.fold(events, happenings)) is None:
+            self.reached[number] = events[-1].sequence
+        else:
+            self.park(number, *refused)
+
+    def park(self, number: int, sequence: int, reason: str) -> None:
+        """Park an episode at an event."""
+        self.reached[number] = sequence - 1
+        self.parked[number] = _writable(f"event {sequence}: {reason}")
 
 
 class FoldRunner:
@@ -172,6 +225,8 @@ class FoldRunner:
         """The state of the target's generation when this process last read it."""
         self.last_number = 0
         """The last episode of the last batch; the next one begins with the episode behind it."""
+        self.companions: Callable[[int], Sequence[FoldRunner]] = lambda _events: ()
+        """Returns the companions of a batch with this number of events."""
         self._types: _Types | None = None
         self._prepared: _PreparedBatch | None = None
         self._ahead: tuple[BatchWorker, BatchPreview] | None = None
@@ -219,7 +274,7 @@ class FoldRunner:
         self._prepared = None
         with self._log.translated():
             self._prepared = batch = await self._folded(spans)
-        return BatchPreview(batch.events, {number: now for number, _, now in batch.steps}, not batch.parked)
+        return BatchPreview(batch.events, batch.reached, not batch.parked)
 
     async def write(self) -> int:
         """Write the prepared batch; return the number of events folded.
@@ -255,23 +310,37 @@ class FoldRunner:
 
     async def _folded(self, spans: Sequence[Span]) -> _PreparedBatch:
         """Read and fold these events, a page at a time, so that the events of a large batch never are in memory."""
-        generation, types = await self._types_now()
-        rows = types.batch()
-        await rows.restore(self._log, spans)
-        reached = {each.number: each.after for each in spans}
-        parked: dict[int, str] = {}
+        payloads = await self._log.declarations()
+        batch = await self._begun(spans, payloads)
+        await batch.rows.restore(self._log, spans)
+        for companion in self.companions(size_of(spans)):
+            try:
+                beside = await companion._begun(spans, payloads, if_continued=True)  # noqa: SLF001 - of this class
+                await beside.rows.restore(self._log, beside.spans)
+            except PycrormError:  # met again, and reported, when the companion folds by itself
+                continue
+            if beside.spans:
+                batch.beside.append(beside)
         for page in pages_of(spans, _PAGE_EVENTS):
-            await self._fold_page([each for each in page if each.number not in parked], rows, reached, parked)
-        await rows.ready(self._log.engine, generation.number)
-        steps = [(each.number, each.after, reached[each.number]) for each in spans]
-        return _PreparedBatch(spans, types, rows, generation.number, steps, parked)
+            await self._fold_page([each for each in page if each.number not in batch.parked], batch)
+        for each in (batch, *batch.beside):
+            await each.rows.ready(self._log.engine, each.number)
+        return batch
 
-    async def _fold_page(
-        self, spans: Sequence[Span], rows: Batch, reached: dict[int, int], parked: dict[int, str]
-    ) -> None:
-        """Fold the events of these spans into `rows`, in order; note the checkpoints and the episodes to park."""
+    async def _begun(
+        self, spans: Sequence[Span], payloads: list[bytes], *, if_continued: bool = False
+    ) -> _PreparedBatch:
+        """Return an empty batch for these spans; with `if_continued`, for those that continue the last batch."""
+        generation, types = await self._types_now(payloads)
+        rows = types.batch()
+        spans = rows.continued(spans) if if_continued else spans
+        return _PreparedBatch(self, spans, types, rows, generation.number, {each.number: each.after for each in spans})
+
+    async def _fold_page(self, spans: Sequence[Span], batch: _PreparedBatch) -> None:
+        """Fold the events of these spans, in order."""
         events = await self._log.spans(spans)
         by_number = {number: [*each] for number, each in groupby(events, key=attrgetter("number"))}
+        batches, reads = (batch, *batch.beside), batch.reads
         folded = _SLICE_EVENTS  # since this yielded to the event loop
         for number, after, last in spans:
             part = consecutive(by_number.get(number, ()), after)
@@ -279,17 +348,18 @@ class FoldRunner:
                 if folded >= _SLICE_EVENTS:
                     await asyncio.sleep(0)
                     folded = 0
-                some = part[first : first + _SLICE_EVENTS]
+                happenings, fault = decode_events(part[first : first + _SLICE_EVENTS], reads)
+                some = part[first : first + len(happenings)]
                 folded += len(some)
-                if (refused := rows.fold(some)) is not None:
-                    sequence, reason = refused
-                    reached[number] = sequence - 1
-                    parked[number] = _writable(f"event {sequence}: {reason}")
+                for each in batches if some else ():
+                    each.add(number, some, happenings)
+                if fault is not None and number not in batch.parked:
+                    batch.park(number, after + first + len(some) + 1, str(fault))
+                if number in batch.parked:
                     break
             else:
-                reached[number] = after + len(part)
-                if reached[number] < last:
-                    parked[number] = await self._target.missing(number, reached[number] + 1)
+                if after + len(part) < last:
+                    batch.parked[number] = await self._target.missing(number, after + len(part) + 1)
 
     async def _write(self, batch: _PreparedBatch) -> int:
         try:
@@ -300,6 +370,8 @@ class FoldRunner:
                 if generation is None or (not grown and not await self._write_rows(connection, batch, generation)):
                     await connection.rollback()
                     return 0
+                for each in batch.beside if not grown else ():
+                    await each.runner._write_beside(connection, each)  # noqa: SLF001 - of this class
         except RowRefused as refusal:
             return await self._isolate(batch.spans, refusal)
         self.generation = generation
@@ -307,8 +379,19 @@ class FoldRunner:
             await sweep(self._log)
         return 0 if grown else batch.events
 
+    async def _write_beside(self, connection: AsyncConnection, batch: _PreparedBatch) -> None:
+        """Write the batch of a companion, or none of it if that is not possible."""
+        try:
+            with self._log.translated():
+                async with connection.begin_nested() as savepoint:
+                    generation = await self._lock_generation(connection, batch, "if free")
+                    if generation is None or not await self._write_rows(connection, batch, generation):
+                        await savepoint.rollback()
+        except (RowRefused, PycrormError):
+            return  # met again, and reported, when the companion folds by itself
+
     async def _lock_generation(
-        self, connection: AsyncConnection, batch: _PreparedBatch
+        self, connection: AsyncConnection, batch: _PreparedBatch, hold: generations.Hold = "share"
     ) -> generations.Generation | None:
         """Lock the generation and create missing tables; return None if its number or revision has changed.
 
@@ -318,7 +401,7 @@ class FoldRunner:
         growing = self.generation is None or types.layout != self.generation.layout
         if growing:
             await dialect_of(connection).lock_log_changes(connection)
-        generation = await self._target.generation(connection, "change" if growing else "share")
+        generation = await self._target.generation(connection, "change" if growing else hold)
         if (generation.number, generation.revision) != (batch.number, types.revision):
             self.generation = generation
             return None
@@ -333,9 +416,8 @@ class FoldRunner:
         await batch.rows.write(connection, generation.number)
         return True
 
-    async def _types_now(self) -> tuple[generations.Generation, _Types]:
-        """Read the declarations. They include those of all stored events: each is stored before its first use."""
-        payloads = await self._log.declarations()
+    async def _types_now(self, payloads: list[bytes]) -> tuple[generations.Generation, _Types]:
+        """Learn these declarations. They include those of all stored events: each is stored before its first use."""
         if self.generation is None:
             async with self._log.reading() as connection:
                 self.generation = await self._target.generation(connection, None)
@@ -451,12 +533,15 @@ async def parked(connection: AsyncConnection, place: str) -> dict[int, str]:
 async def advance(
     connection: AsyncConnection, place: str, steps: Sequence[Progress], parked: Mapping[int, str]
 ) -> bool:
-    """Write (number, folded before, folded now) of each episode, and park some; return False if a checkpoint moved."""
+    """Write (number, folded before, folded now) of each episode, and park some.
+
+    Returns False if a checkpoint has moved, or an episode is parked already.
+    """
     dialect = dialect_of(connection)
     progress = _table(place)
-    query = select(progress.c.id, progress.c.folded).where(progress.c.id.in_([number for number, _, _ in steps]))
+    query = select(*progress.c).where(progress.c.id.in_([number for number, _, _ in steps]))
     rows = await connection.execute(query.order_by(progress.c.id).with_for_update())
-    present: dict[int, int] = {row.id: row.folded for row in rows}
+    present: dict[int, int] = {row.id: row.folded if row.parked is None else -1 for row in rows}
     if any(present.get(number, 0) != before for number, before, _ in steps):
         return False
     new = [(number, now, None) for number, _, now in steps if number not in present]

@@ -56,6 +56,7 @@ class Projector:
         self._has_news = True
         self._target = LiveTarget(log)
         self._batch_events = batch_events
+        self._until_visible = False
         self.runner = FoldRunner(self._target, batch_events=batch_events)
 
     async def open(self) -> None:
@@ -83,6 +84,7 @@ class Projector:
                     if registered.get(name) != layout.user_views.get(name):  # new or changed by this caller
                         raise CallerError(f"the database refuses the view {name}: {reason}")
             self.runner = FoldRunner(self._target, batch_events=self._batch_events)
+            self.runner.companions = self._companions
             self.runner.generation = generation
             await sweep(self._log)
 
@@ -94,8 +96,12 @@ class Projector:
         """
         count = 0
         with self._log.translated():
-            while (folded := await self.runner.fold_next()) is not None:
-                count += folded
+            self._until_visible = True
+            try:
+                while (folded := await self.runner.fold_next()) is not None:
+                    count += folded
+            finally:
+                self._until_visible = False
             while await self._refresh():
                 pass
             while await self._custom.fold_next_batch(now=True, until_visible=True):
@@ -114,6 +120,9 @@ class Projector:
         """
         with self._log.translated():
             return await self._refresh() or await self._custom.fold_next_batch(now=now)
+
+    def _companions(self, events: int) -> Sequence[FoldRunner]:
+        return self._custom.companions(events, until_visible=self._until_visible)
 
     async def _refresh(self) -> bool:
         generation = self.runner.generation

@@ -14,7 +14,7 @@ from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailab
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.order import OrderCheck
-from pycrorm_async.events.types import EpisodeEnded, ObjectAdded, references_in
+from pycrorm_async.events.types import EpisodeEnded, Happening, ObjectAdded, references_in
 from pycrorm_async.projections import custom, findings, fold, pipeline
 from pycrorm_async.projections.columns import OWN, Layout, unite
 from pycrorm_async.projections.generations import (
@@ -234,14 +234,19 @@ class EpisodeCheck:
         self._lost: int | None = None
         self._open_when_lost: set[int] = set()
 
-    def read(self, span: stored.Span, events: Mapping[int, stored.StoredEvent]) -> None:
+    def read(
+        self,
+        span: stored.Span,
+        events: Mapping[int, stored.StoredEvent],
+        happenings: Mapping[int, Happening | Exception],
+    ) -> None:
         """Check the events of the next span, given by sequence, and fold those that are visible."""
         episode = self._episode
         for sequence in range(span.after + 1, span.last + 1):
             event = events.get(sequence)
             if event is not None:
                 self._in_gap = False
-                self._one(event)
+                self._one(event, happenings[sequence])
                 if sequence == 1 and event.wall_ns != episode.started_wall_ns:
                     self._damaged(1, f"the episode's started_wall_ns is {episode.started_wall_ns}{_OTHER_TIME}")
             elif not self._in_gap:
@@ -264,7 +269,7 @@ class EpisodeCheck:
         of_whole = difference.table in ("process_metadata", "simulated_episode")
         return difference.sequence >= self._lost or open_then or of_whole
 
-    def _one(self, event: stored.StoredEvent) -> None:
+    def _one(self, event: stored.StoredEvent, happening: Happening | Exception) -> None:
         shown = event.sequence <= self._episode.folded
         self._result.events += 1
         self._result.behind += not shown
@@ -273,7 +278,8 @@ class EpisodeCheck:
         for reference in references_in(event.type, event.payload):
             self._result.blobs.setdefault(reference.hash, (self._number, event.sequence))
         try:
-            happening = fold.happening_of(event)
+            if isinstance(happening, Exception):
+                raise happening  # noqa: TRY301  one that folding raises is reported alike
             described = happening.description if isinstance(happening, ObjectAdded) else None
             self.described = self.described or (described is not None and event.sequence <= stored.BLOCK_EVENTS)
             if described is not None and described not in self._descriptions:
@@ -453,17 +459,27 @@ async def _read_part(
         spans = [each for each in page if each.number not in unreadable]
         faults: list[findings.Unreadable] = []
         events = await _readable_events(log, connection, spans, faults)
-        by_number = {number: [*each] for number, each in groupby(events, key=attrgetter("number"))}
+        by_number: dict[int, tuple[Sequence[stored.StoredEvent], Sequence[Happening | Exception]]] = {}
+        for number, each in groupby(events, key=attrgetter("number")):
+            some = [*each]
+            by_number[number] = some, [*map(_happening_or_fault, some)]
         ends = {each.number: each.sequence for each in faults}
         for span in spans:
             read = span._replace(last=ends.get(span.number, span.last + 1) - 1)
             for check in checks:
-                check.read(read, by_number.get(span.number, ()))
+                check.read(read, *by_number.get(span.number, ((), ())))
         for fault in faults:
             unreadable.add(fault.number)
             result.add_damage(fault.number, fault.sequence, f"cannot be read: {fault}")
             for check in checks:
                 check.lose(fault.number, fault.sequence)
+
+
+def _happening_or_fault(event: stored.StoredEvent) -> Happening | Exception:
+    try:
+        return fold.happening_of(event)
+    except Exception as fault:  # noqa: BLE001  reported by each check that reads the event
+        return fault
 
 
 async def _readable_events(
@@ -601,10 +617,12 @@ class _TablesCheck:
                 self._result.add_damage(each.number, fault.sequence, fault.reason)
         return True
 
-    def read(self, span: stored.Span, events: Sequence[stored.StoredEvent]) -> None:
+    def read(
+        self, span: stored.Span, events: Sequence[stored.StoredEvent], happenings: Sequence[Happening | Exception]
+    ) -> None:
         by_sequence = {each.sequence: each for each in events}
         episode, digests = self._episodes[span.number], self._digests.get(span.number)
-        episode.read(span, by_sequence)
+        episode.read(span, by_sequence, dict(zip(by_sequence, happenings, strict=True)))
         if digests is not None:
             digests.read(span, episode.head, by_sequence, self._kept.get(span.number, {}), episode)
 
@@ -711,13 +729,25 @@ class ProjectionCheck:
         self._refused, self._lost = {}, set()
         return True
 
-    def read(self, span: stored.Span, events: Sequence[stored.StoredEvent]) -> None:
+    def read(
+        self, span: stored.Span, events: Sequence[stored.StoredEvent], happenings: Sequence[Happening | Exception]
+    ) -> None:
         number, after, last = span
         count = min(last, self._folded.get(number, 0)) - after
         if self._comparison is None or number in self._refused or count <= 0:
             return
         whole = stored.consecutive(events, after)[:count]
-        refused = self._rows.fold(whole) if whole else None
+        decoded: list[Happening | None] = []
+        fault: tuple[int, str] | None = None
+        for event, each in zip(whole, happenings, strict=False):
+            if not isinstance(each, Exception):
+                decoded.append(each)
+            elif self._rows.reads is None or event.type in self._rows.reads:
+                fault = event.sequence, str(each)
+                break
+            else:
+                decoded.append(None)
+        refused = (self._rows.fold(whole[: len(decoded)], decoded) if decoded else None) or fault
         if refused is None and len(whole) < count:
             refused = after + len(whole) + 1, "it is missing in the log"
         if refused is not None:

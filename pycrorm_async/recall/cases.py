@@ -21,7 +21,7 @@ not features. `near` never contains the robot or the environment.
 start, its outcome.
 
 >>> cases: list[Case] = []
->>> EpisodeCases().read(events, declarations.get, cases)
+>>> EpisodeCases().read(zip(events, happenings, strict=True), declarations.get, cases)
 
 The fold is pure, and its memory grows with the nodes that run and the objects in the world. Besides the features of
 `situation` a case has `inside`, the type of the nearest action around it, and `after` and `after_status`, type and
@@ -49,7 +49,6 @@ from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
 from pycrorm_async.projections.findings import Comparison, EpisodeRange, TableCheck, TableDifference, VerifyResult
-from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.generations import select_generation
 from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import is_missing, row_of
@@ -79,7 +78,9 @@ class CaseBatch(ProjectedBatch):
         self.cases: list[Case] = []
         self._insertion: Insertion = None
 
-    def add(self, fold: EpisodeCases, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+    def add(
+        self, fold: EpisodeCases, events: Iterable[tuple[StoredEvent, event_types.Happening]], *, kept: bool
+    ) -> Refused | None:
         return fold.read(events, self._declared.get, self.cases if kept else [])
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
@@ -441,14 +442,18 @@ class EpisodeCases:
         """The wall time at which the monotonic clock of the episode was zero, according to its first event. Starts are
         reckoned from it, so that actions keep their order when the wall clock is set meanwhile."""
 
-    def read(self, events: Iterable[StoredEvent], declaration_of: DeclarationOf, cases: list[Case]) -> Refused | None:
+    def read(
+        self,
+        events: Iterable[tuple[StoredEvent, event_types.Happening]],
+        declaration_of: DeclarationOf,
+        cases: list[Case],
+    ) -> Refused | None:
         """Apply the next events, of the types in `READS`; append the cases of the actions that they end to `cases`.
 
         Returns the first event that cannot be folded, with the exception; those behind it are not applied.
         """
-        for event in events:
+        for event, happening in events:
             try:
-                happening = happening_of(event)
                 if isinstance(happening, event_types.NodeStarted):
                     self._start(event, happening, declaration_of)
                 elif isinstance(happening, event_types.NodeEnded):

@@ -27,10 +27,18 @@ from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
-from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, ObjectAdded, ObjectReference, RobotValue
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    Happening,
+    ObjectAdded,
+    ObjectReference,
+    RobotValue,
+)
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.query.frames import member_of
 from pycrorm_async.query.named_queries import EpisodeSummary
@@ -854,7 +862,8 @@ class ProcessCases:
             if running is not None and sequence > running.reached:
                 kind, payload = type(happening), encode(happening)
                 identity = running.number, sequence, kind.__name__, kind.version
-                running.unnumbered += self._read(running, StoredEvent(*identity, wall_ns, monotonic_ns, payload))
+                stored = StoredEvent(*identity, wall_ns, monotonic_ns, payload)
+                running.unnumbered += self._read(running, stored, happening)
         cases += await self._numbered()
         return cases, [case for each in self._episodes.values() for case in each.unnumbered]
 
@@ -876,18 +885,22 @@ class ProcessCases:
             row = await episode_named(log, episode_text(episode))
             running = self._episodes[row.id] = _Running(row.id, row.number, is_numbered=True)
             async for page in log.pages(row):
-                for stored in page:
-                    cases += self._read(running, stored)
+                happenings, undecodable = decode_events(page, _READS)
+                for stored, happening in zip(page, happenings, strict=False):
+                    cases += self._read(running, stored, happening)
+                if undecodable is not None:
+                    running.has_ended = True  # the fold of the tables parks the episode, with the reason
+                    break
         return cases
 
-    def _read(self, running: _Running, stored: StoredEvent) -> Sequence[Case]:
+    def _read(self, running: _Running, stored: StoredEvent, happening: Happening | None) -> Sequence[Case]:
         running.reached = stored.sequence
         running.has_ended = running.has_ended or stored.type == EpisodeEnded.__name__
-        if stored.type not in _READS:
+        if happening is None:
             return ()
         cases: list[Case] = []
-        if running.fold.read([stored], self.emitter.feed.declaration, cases) is not None:
-            running.has_ended = True  # the fold of the tables parks the episode, with the reason
+        if running.fold.read([(stored, happening)], self.emitter.feed.declaration, cases) is not None:
+            running.has_ended = True  # as above
         return cases
 
     async def _numbered(self) -> list[Case]:

@@ -19,6 +19,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.projections import custom, pipeline
 from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection, learner_of, states
 from pycrorm_async.projections.findings import TableDifference
+from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.projections.generations import PROJECTION
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.pipeline import FoldRunner, SideTarget
@@ -323,7 +324,8 @@ class Wrong(Projection):
 )
 def test_a_row_that_cannot_be_stored_is_refused_alike_on_every_database(changes: Any, reason: str) -> None:
     rows = CustomRows(Wrong(("wrong_row", row(1, slot=1), {"n": 1}), *changes), {})
-    refused = rows.fold(tries().stored()[:1])
+    events = tries().stored()[:1]
+    refused = rows.fold(events, decode_events(events)[0])
     assert refused is not None
     assert refused[0] == 1
     assert re.search(reason, refused[1])

@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 import pytest
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, EpisodeTagged, NodeEnded, NodeStarted
-from pycrorm_async.projections import custom
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, EpisodeTagged, Happening, NodeEnded, NodeStarted
+from pycrorm_async.projections import custom, fold
 from pycrorm_async.projections.custom import (
     Changes,
     CustomRows,
@@ -22,13 +22,17 @@ from pycrorm_async.projections.custom import (
     EpisodeFolds,
     EpisodeProjection,
     Event,
+    Projection,
+    own_projections,
     states,
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Span, StoredEvent
 from tests.commands import FORKED, fork
 from tests.projections.event_script import PICK_UP, Script, declarations, mixed, name_of, row
 from tests.projections.sql_queries import ask
@@ -193,6 +197,53 @@ async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(
     assert await rows_in(log) == [each for number in range(1, 8) for each in expected(number, tries)]
 
 
+async def test_tables_and_projections_fold_an_event_in_one_pass_and_one_transaction(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads, decoded = Counter[int](), Counter[str]()
+    spans, happening_of = EventLog.spans, fold.happening_of
+
+    async def counted_spans(self: EventLog, some: Sequence[Span]) -> list[StoredEvent]:
+        reads.update(sequence for each in some for sequence in range(each.after + 1, each.last + 1))
+        return await spans(self, some)
+
+    def counted_decoding(event: StoredEvent) -> Happening:
+        decoded[f"{event.number}/{event.sequence}"] += 1
+        return happening_of(event)
+
+    tries = [("LEFT", "FAILED"), ("RIGHT", "SUCCEEDED"), ("LEFT", "SUCCEEDED")]
+    records = [*declarations(PICK_UP), *episode(1, tries).records]
+    projector = Projector(log, projections=[Attempts(), Tries()], installed=own_projections())
+    await projector.open()
+    monkeypatch.setattr(EventLog, "spans", counted_spans)
+    monkeypatch.setattr(fold, "happening_of", counted_decoding)
+    for some in (records[:6], records[6:]):  # the second batch continues the episode
+        await log.append(some)
+        writes = log.writes
+        await projector.catch_up()
+        assert log.writes == writes + 1
+    assert set(reads.values()) == set(decoded.values()) == {1}
+    assert len(reads) == len(decoded) == len(records) - 1
+    assert await rows_in(log) == expected(1, tries)
+    assert await ask(log, "SELECT id FROM trial ORDER BY id") == [(each[0],) for each in expected(1, tries)[:-1]]
+    assert [(each.name, each.behind) for each in await states(log, [])] == [
+        ("attempts", 0),
+        ("recall", 0),
+        ("tries", 0),
+    ]
+    assert (await verify(log, projections=[Attempts(), Tries(), *own_projections()])).drift == 0
+
+
+class Tries(Projection):
+    """A projection without a state."""
+
+    name, tables = "tries", {"trial": {"arm": "text"}}
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        if event.dtype == "PickUpAction":
+            rows.insert("trial", event.id, arm=event.parameters["arm"])
+
+
 class Moody(Attempts):
     """A fold that depends on more than the events: it refuses to read an episode a second time."""
 
@@ -243,6 +294,32 @@ async def test_a_row_that_the_database_refuses_stops_its_episode_alone(log: Even
     assert await rows_in(log) == [expected(1, tries)[0], refused, *expected(2, tries, ends=False)]
 
 
+async def test_a_projection_that_cannot_be_written_leaves_the_batch_of_the_tables_whole(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
+    await log.append([*declarations(PICK_UP), *episode(1, tries).records[:5]])
+    projector = await projector_of(log)
+    await projector.catch_up()
+    await log.append(episode(1, tries).records)
+    write = CustomRows.write
+    folded: list[list[tuple[Any, ...]]] = []
+
+    async def refused(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
+        await write(self, connection, generation)
+        if not folded:
+            folded.append((await connection.exec_driver_sql("SELECT folded FROM episode")).all())  # type: ignore[arg-type]
+            raise RowRefused("the disk of the projection is full")
+
+    monkeypatch.setattr(CustomRows, "write", refused)
+    assert await projector.runner.fold_next() == 3
+    assert folded == [[(8,)]]
+    assert await ask(log, "SELECT count(*) FROM episode WHERE folded = head") == [(1,)]
+    assert len(await rows_in(log)) == 2
+    await projector.catch_up()
+    assert await rows_in(log) == expected(1, tries)
+
+
 def _die_in_second_batch(url: str) -> None:
     write, count = CustomRows.write, 0
 
@@ -262,20 +339,26 @@ def _die_in_second_batch(url: str) -> None:
         asyncio.run(fold())
 
 
-async def test_a_killed_fold_continues_with_the_state_of_its_episodes(log: EventLog, database_url: str) -> None:
+@pytest.mark.parametrize("beside_tables", [False, True])
+async def test_a_killed_fold_continues_with_the_state_of_its_episodes(
+    log: EventLog, database_url: str, *, beside_tables: bool
+) -> None:
     tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED"), ("RIGHT", "FAILED"), ("LEFT", "FAILED")]
     records = [*declarations(PICK_UP), *mixed(episode(1, tries), episode(2, tries))]
     await log.append(records)
     await projector_of(log)
     await Projector(log).open()
-    plain = Projector(log)
-    await plain.open()
-    await plain.catch_up()
+    if not beside_tables:
+        plain = Projector(log)
+        await plain.open()
+        await plain.catch_up()
     process = FORKED.Process(target=_die_in_second_batch, args=(database_url,))
     fork(process)
     await asyncio.to_thread(process.join)
     assert process.exitcode == -signal.SIGKILL
     assert len(await rows_in(log)) == 2
+    if beside_tables:
+        assert await ask(log, "SELECT sum(folded) FROM episode") == [(6,)]
     await (await projector_of(log)).catch_up()
     assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
     assert (await verify(log, projections=[Attempts()])).drift == 0

@@ -36,8 +36,9 @@ from pycrorm_async.events.types import (
     StateSampled,
 )
 from pycrorm_async.projections.columns import COLUMNS
-from pycrorm_async.projections.fold import fold
+from pycrorm_async.projections.fold import fold_happening, happening_of
 from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
+from pycrorm_async.store.stored import StoredEvent
 from tests.projections.event_script import (
     NAVIGATE,
     PICK_UP,
@@ -68,6 +69,10 @@ EVERYTHING = declared(
     field("things", "list", 12, item="object"),
     field("names", "list", 13, item="text"),
 )
+
+
+def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
+    fold_happening(event, happening_of(event), designators, rows)
 
 
 def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:

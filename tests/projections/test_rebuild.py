@@ -18,6 +18,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
+from pycrorm_async.events.types import Happening
 from pycrorm_async.operations import rebuild as rebuilding
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.workers import Assignment
@@ -346,15 +347,23 @@ async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class NothingToDo:
+        reads: frozenset[str] | None = None
+
+        def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
+            return spans
+
         async def restore(self, log: EventLog, spans: Sequence[Span]) -> None: ...
 
-        def fold(self, events: Sequence[StoredEvent]) -> None: ...
+        def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> None: ...
 
         async def ready(self, engine: AsyncEngine, generation: int) -> None: ...
 
         async def write(self, connection: AsyncConnection, generation: int) -> None: ...
 
-    events = [StoredEvent(number, turn, "", 1, 1, 1, b"") for number in range(1, 101) for turn in range(1, 21)]
+    ended = b'{"node":1,"status":"SUCCEEDED"}'
+    events = [
+        StoredEvent(number, turn, "NodeEnded", 1, 1, 1, ended) for number in range(1, 101) for turn in range(1, 21)
+    ]
     turns = 0
 
     async def read(_: EventLog, _spans: Sequence[Span]) -> list[StoredEvent]:

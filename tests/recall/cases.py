@@ -29,6 +29,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.columns import Layout
 from pycrorm_async.projections.custom import learner_of
+from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.recall.blocks import Block
 from pycrorm_async.recall.cases import CaseBatch, CaseProjection
 from pycrorm_async.recall.columns import Case
@@ -91,7 +92,8 @@ def cases_of(*scripts: Script, first_number: int = 1) -> list[Case]:
     rows = batch()
     assert isinstance(rows, CaseBatch)
     for number, script in enumerate(scripts, first_number):
-        assert rows.fold(script.stored(number)) is None
+        events = script.stored(number)
+        assert rows.fold(events, decode_events(events)[0]) is None
     return in_order(Block.of(rows.cases).cases()) if rows.cases else []
 
 
