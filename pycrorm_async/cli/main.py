@@ -16,6 +16,7 @@ import functools
 import gc
 import inspect
 import io
+import keyword
 import logging
 import os
 import re
@@ -121,7 +122,7 @@ def panels() -> Mapping[str, Mapping[str, str]]:
     """Return the verbs with their lines, by panel. They are read from the files' begins, because loading takes long."""
     begins = {each.stem: _MODULE.match(each.read_text(encoding="utf-8")) for each in Path(__file__).parent.glob("*.py")}
     verbs = sorted(
-        (int(begin["place"]), begin["panel"], stem.replace("_", "-"), begin["line"])
+        (int(begin["place"]), begin["panel"], stem.rstrip("_").replace("_", "-"), begin["line"])
         for stem, begin in begins.items()
         if begin is not None
     )
@@ -131,7 +132,8 @@ def panels() -> Mapping[str, Mapping[str, str]]:
 def app(requested: str | None = None) -> typer.Typer:
     """Build the command with the requested verb, with all verbs, or with the names of all if it is not a verb.
 
-    Each verb is a function in the module of the same name, with `_` for `-`; a module with `VERBS` is a group of these.
+    Each verb is a function in the module of the same name, with `_` for `-`, and behind a word of Python a further `_`;
+    a module with `VERBS` is a group of these.
     Only requested modules are loaded, because loading all takes two seconds, and most single ones take half of that.
     """
     command = typer.Typer(
@@ -147,10 +149,11 @@ def app(requested: str | None = None) -> typer.Typer:
         if requested not in (None, name):
             command.command(name, help=lines[name])(lambda: None)
             continue
-        module = import_module(f"pycrorm_async.cli.{name.replace('-', '_')}")
+        function = f"{name}_" if keyword.iskeyword(name) else name.replace("-", "_")
+        module = import_module(f"pycrorm_async.cli.{function}")
         verbs: Mapping[str, Callable[..., int | None]] | None = getattr(module, "VERBS", None)
         if verbs is None:
-            command.command(name)(_as_command(getattr(module, name.replace("-", "_"))))
+            command.command(name)(_as_command(getattr(module, function)))
             continue
         without_verb = getattr(module, "without_verb", None)
         group = typer.Typer(help=lines[name], no_args_is_help=without_verb is None)

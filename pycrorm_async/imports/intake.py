@@ -13,19 +13,22 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Protocol, Self, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias, cast, get_args
 
 import msgspec
 
-from pycrorm_async.errors import CallerError, FilesError
-from pycrorm_async.events.types import FieldDeclared, NodeStatus, PoseValue
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import episode_text, named_episode_id
+from pycrorm_async.events.types import EpisodeStatus, FieldDeclared, NodeStatus, PoseValue
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.record.declarations import FieldSpec
 from pycrorm_async.record.plan_types import built_in_declaration
+from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import json_text
 
@@ -37,6 +40,11 @@ built-in type has; further parameters are JSON in the field `further`."""
 _IDENTITY_BYTES = 2**20
 """The bytes at both ends of a file that identify it, so that a large bag is not read twice."""
 
+_WORDS = re.compile(r"[A-Za-z0-9]+")
+_NAME_MAX = 50
+"""Bounds the characters of the name of a type or a field: PostgreSQL cuts names of tables at 63 bytes."""
+_END_STATUSES = frozenset(get_args(EpisodeStatus)) - {"RUNNING"}
+
 Numbers: TypeAlias = Sequence[float]
 
 
@@ -44,10 +52,6 @@ class ObjectKey(NamedTuple):
     """A parameter that is an object, by the key with which it was added."""
 
     key: Hashable
-
-
-class FileCut(FilesError):
-    """A file ends in the middle of a record; what stands before is imported."""
 
 
 class WrongFormat(CallerError):
@@ -72,7 +76,8 @@ class ImportFormat(NamedTuple):
     """A format of files that can be imported.
 
     Attributes:
-        read: gives the episodes of a file or folder to the intake. Raises `WrongFormat` and `FileCut`.
+        read: gives the episodes of a file or folder to the intake. Raises `WrongFormat`; of a file that is cut, it
+            gives what stands before.
         describes: the files, in one line.
         map_file: the class of its settings.
     """
@@ -87,8 +92,9 @@ class EpisodeReport:
     """An episode of an import.
 
     Attributes:
-        name: from which its id is made.
+        id: made from its name.
         state: `imported`, or `already stored`; of a dry run `would be imported`.
+        refusal: why the memory has not recorded all of it: it holds another beginning of this episode.
         nodes, objects: the number of nodes and of objects.
         changes: the number of moves of objects and of joints.
         removals: the number of objects that left the world.
@@ -97,7 +103,7 @@ class EpisodeReport:
         statuses: how many nodes ended with each status.
     """
 
-    name: str
+    id: str
     description: str
     state: Literal["imported", "would be imported", "already stored"]
     nodes: int = 0
@@ -107,6 +113,7 @@ class EpisodeReport:
     samples: int = 0
     observations: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
+    refusal: str | None = None
 
 
 @dataclass
@@ -124,18 +131,12 @@ class ImportReport:
     cut: list[str] = field(default_factory=list)
 
 
-class StoredEpisodes(Protocol):
-    """Answers whether the memory holds a whole episode of this name."""
-
-    def __call__(self, name: str, /) -> bool: ...
-
-
 class Intake:
     """Takes the episodes of one import.
 
     Args:
         recording: of the memory; None only counts.
-        is_stored: whether the memory holds the episode of a name already.
+        stored: the ids of the episodes that the memory holds already, for a dry run.
         report_progress: gets what is done and the total, in a unit of the format's choice.
     """
 
@@ -144,13 +145,13 @@ class Intake:
         format_name: str,
         settings: MapFile,
         recording: Recording | None = None,
-        is_stored: StoredEpisodes = lambda _name: False,
+        stored: Container[str] = (),
         report_progress: ProgressCallback | None = None,
     ) -> None:
         self.report: Final = ImportReport(format_name)
         self.settings = settings
         self.recording = recording
-        self._is_stored = is_stored
+        self._stored = stored
         self._report_progress = report_progress
         self._types: dict[str, set[str]] = {}
 
@@ -173,16 +174,12 @@ class Intake:
         """
         settings, format_name = self.settings, self.report.format
         full_name = "/".join(filter(None, ("import", format_name, settings.name, name)))
-        text = settings.description or description
-        report = EpisodeReport(full_name, text, "imported" if self.recording is not None else "would be imported")
+        identity, text = episode_text(named_episode_id(full_name)), settings.description or description
+        report = EpisodeReport(identity, text, "imported" if self.recording is not None else "would be imported")
         self.report.episodes.append(report)
-        if self._is_stored(full_name):
-            report.state = "already stored"
-            return IntakeEpisode(self, report, None, at)
         recorded = None
         if self.recording is not None:
-            open_episode: Any = self.recording.episode
-            recorded = open_episode(
+            recorded = self.recording.episode(
                 id=full_name,
                 at=at,
                 description=text,
@@ -190,6 +187,8 @@ class Intake:
                 tags=(*settings.tags, *(each for each in tags if each not in settings.tags)),
                 metadata={"import": format_name, **metadata},
             )
+        if identity in self._stored or (recorded is not None and recorded.is_recorded):
+            report.state = "already stored"
         return IntakeEpisode(self, report, recorded, at)
 
     def left_out(self, what: str, why: str, count: int = 1) -> None:
@@ -206,7 +205,12 @@ class Intake:
             self._report_progress(done, total)
 
     def typed(self, dtype: str, parameters: Mapping[str, Any]) -> tuple[str, dict[str, FieldSpec], dict[str, Any]]:
-        """Return the dtype, the fields and the parameters of a node, as the types of this import allow them."""
+        """Return the dtype, the fields and the parameters of a node, as the types of this import allow them.
+
+        A name with other signs than ASCII letters, digits and `_` becomes one of these, and the first parameter.
+        """
+        if (name_of_type := _name_of(dtype, "Step")) != dtype:
+            dtype, parameters = name_of_type, {"name": dtype, **parameters}
         if dtype not in self._types and len(self._types) >= TYPES_MAX:
             self.left_out("types", f"a file has at most {TYPES_MAX} of its own; these nodes are of the type Step")
             dtype, parameters = "Step", {"name": dtype, **parameters}
@@ -216,11 +220,12 @@ class Intake:
         fields: dict[str, FieldSpec] = {}
         values: dict[str, Any] = {}
         further: dict[str, Any] = {}
-        for name, value in parameters.items():
+        for given, value in parameters.items():
             if value is None:
                 continue
-            if name not in declared and len(declared) >= FIELDS_MAX:
-                further[name] = value
+            name = _name_of(given, "value")
+            if name in values or (name not in declared and len(declared) >= FIELDS_MAX):
+                further[given] = value
                 continue
             declared.add(name)
             fields[name], values[name] = _recorded(value, known.get(name))
@@ -236,7 +241,7 @@ class IntakeEpisode:
         is_stored: whether the memory holds the episode already, so that its calls record nothing.
     """
 
-    def __init__(self, intake: Intake, report: EpisodeReport, recorded: Any, at: int) -> None:
+    def __init__(self, intake: Intake, report: EpisodeReport, recorded: RecordedEpisode | None, at: int) -> None:
         self.is_stored: Final = report.state == "already stored"
         self._intake = intake
         self._report = report
@@ -245,7 +250,7 @@ class IntakeEpisode:
         self._open: dict[Hashable, None] = {}
         self._poses: dict[Hashable, tuple[float, ...]] = {}
         self._joints: dict[Hashable, dict[str, float]] = {}
-        self._status: Any = "UNKNOWN"
+        self._status: EpisodeStatus = "UNKNOWN"
 
     def __enter__(self) -> Self:
         return self
@@ -280,20 +285,21 @@ class IntakeEpisode:
     def end(
         self,
         key: Hashable,
-        status: NodeStatus | Literal["UNKNOWN"],
+        status: NodeStatus,
         at: int,
         *,
         failure: tuple[str, str] | str | None = None,
         result: Any = None,
+        untimed: bool = False,
     ) -> None:
-        """Record that a node ended; nothing if it is not open."""
+        """Record that a node ended, `untimed` if it is not known when; nothing if it is not open."""
         self._last = max(self._last, at)
         if key not in self._open:
             return
         del self._open[key]
         self._report.statuses[status] += 1
         if self._recorded is not None:
-            self._recorded.end(key, status, failure, result, at=at)
+            self._recorded.end(key, status, failure, result, at=at, untimed=untimed)
 
     def is_open(self, key: Hashable) -> bool:
         """Return whether a node with this key has started and not ended."""
@@ -359,17 +365,6 @@ class IntakeEpisode:
         if self._recorded is not None:
             self._recorded.joints_moved(key, changed, at=at)
 
-    def sampled(self, key: Hashable, channels: Sequence[str], values: Sequence[Numbers], at: Sequence[int]) -> None:
-        """Record a block of samples of an object: for each time, a number for each channel."""
-        if not at:
-            return
-        self._last = max(self._last, at[-1])
-        if self.is_stored:
-            return
-        self._report.samples += 1
-        if self._recorded is not None:
-            self._recorded.sampled(key, channels, values, at)
-
     def observe(self, name: str, values: object, at: int, *, node: Hashable | None = None) -> None:
         """Record an observation, of the node if that is open, else of the episode."""
         self._last = max(self._last, at)
@@ -379,17 +374,24 @@ class IntakeEpisode:
         if self._recorded is not None:
             self._recorded.observe(name, values, node=node if node in self._open else None, at=at)
 
-    def ended(self, status: Any, at: int | None = None) -> None:
-        """Set how the episode ended (UNKNOWN by default), and when, if that is after its last event."""
-        self._status = status
+    def ended(self, status: object, at: int | None = None) -> None:
+        """Set how the episode ended, and when, if that is after its last event; by default UNKNOWN."""
+        self._status = "UNKNOWN" if status not in _END_STATUSES else cast("EpisodeStatus", status)
         self._last = max(self._last, at or 0)
 
     def _end_all(self) -> None:
         """End the nodes that never ended, the innermost first, and the episode."""
         for key in reversed(list(self._open)):
-            self.end(key, "UNKNOWN", self._last)
+            self.end(key, "UNKNOWN", self._last, untimed=True)
         if self._recorded is not None:
             self._recorded.close(status=self._status, at=self._last)
+            self._report.refusal = self._recorded.refusal
+
+
+def _name_of(text: str, otherwise: str) -> str:
+    """Return the name of a type or a field that is most like a text of a file."""
+    name = "_".join(_WORDS.findall(text))[:_NAME_MAX].strip("_")
+    return name if name and not name[0].isdigit() else "_".join(filter(None, (otherwise, name)))
 
 
 def _recorded(value: Any, known: FieldDeclared | None) -> tuple[FieldSpec, Any]:

@@ -1,7 +1,8 @@
 """Find the format of an import by its name, read its map file, and run it on a memory, or count what it would record.
 
->>> import_files("trace", ["run.json"], Memory.sync("sqlite:///memory.db"))
-ImportReport(format='trace', episodes=[EpisodeReport(name='import/trace/…', …)], …)
+>>> with Memory.sync("sqlite:///memory.db") as memory:
+...     import_files("trace", ["run.json"], memory.recording)
+ImportReport(format='trace', episodes=[EpisodeReport(id='432178db-930b-5aac-b76f-4affd3efcf41', …)], …)
 
 A package adds a format with an entry point in the group `pycrorm.import_formats`, whose name is that of the format and
 whose value is an `ImportFormat`.
@@ -9,7 +10,7 @@ whose value is an `ImportFormat`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
 from os import PathLike
@@ -19,14 +20,14 @@ from typing import Final
 import msgspec
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.imports.intake import FileCut, ImportFormat, ImportReport, Intake, MapFile
+from pycrorm_async.imports.intake import ImportFormat, ImportReport, Intake, MapFile
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.query.text import nearest
 from pycrorm_async.record.recording import Recording
 
 GROUP: Final = "pycrorm.import_formats"
 """The group of the entry points of formats."""
-_BUILT_IN: Final = {"trace": "trace"}
+_BUILT_IN: Final = {"trace": "trace", "btlog": "btlog"}
 """The modules of the built-in formats, by name, loaded when they are used. `FORMAT` in each is its `ImportFormat`."""
 
 
@@ -67,12 +68,13 @@ def import_files(
     recording: Recording | None,
     *,
     map_file: Path | None = None,
+    stored: Container[str] = (),
     report_progress: ProgressCallback | None = None,
 ) -> ImportReport:
     """Import files into the memory of `recording`; without one, count what would be recorded.
 
     Each path is read apart, and a path that is cut in the middle does not stop the next one. An episode that the memory
-    holds already is not recorded again.
+    holds already is not recorded again; a dry run knows them from `stored`, their ids.
 
     Raises:
         CallerError: the format, the map file or a path is unknown, or a file is of another format. Nothing of that path
@@ -85,12 +87,10 @@ def import_files(
     for path in present:
         if not path.exists():
             raise CallerError(f"{path} does not exist")
-    intake = Intake(file_format, settings, recording, report_progress=report_progress)
+    intake = Intake(file_format, settings, recording, stored, report_progress)
     for path in present:
         try:
             chosen.read(path, settings, intake)
-        except FileCut as error:
-            intake.cut(path, str(error))
         except OSError as error:
             raise CallerError(f"{path} cannot be read: {error.strerror or error}") from None
     return intake.report

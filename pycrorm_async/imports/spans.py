@@ -35,7 +35,7 @@ class Span:
     end: int | None
     parent: Hashable | None = None
     kind: Literal["action", "motion", "language"] = "action"
-    status: NodeStatus | Literal["UNKNOWN"] = "UNKNOWN"
+    status: NodeStatus = "UNKNOWN"
     failure: tuple[str, str] | None = None
     result: Any = None
     instants: Sequence[tuple[int, str, object]] = ()

@@ -46,7 +46,7 @@ _TIMES_NS = range(2**63)
 _EPOCH_US = range(10**15, 10**16)
 """Times in µs that count from 1970: those of the years 2001 to 2286. Other clocks of traces begin near zero."""
 _GAP = re.compile(r"[\s,]*")
-_STATUSES = get_args(NodeStatus)
+_STATUSES = frozenset(get_args(NodeStatus)) - {"RUNNING"}
 _INSTANTS = frozenset("iIRn")
 _Give: TypeAlias = Callable[[IntakeEpisode, int], None]
 _OTHERS = {
@@ -75,7 +75,7 @@ class TraceMap(intakes.MapFile, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 def read_trace(path: Path, settings: TraceMap, intake: Intake) -> None:
-    """Give the episodes of a trace file to the intake. Raises `WrongFormat` and `FileCut`."""
+    """Give the episodes of a trace file to the intake. Raises `WrongFormat`."""
     if path.is_dir():
         raise intakes.WrongFormat(f"{path} is a folder: name the trace files in it")
     content, cut = _uncompressed(path)
@@ -86,7 +86,7 @@ def read_trace(path: Path, settings: TraceMap, intake: Intake) -> None:
         _read_otlp(path, document["lines"], settings, intake)
     if offset is not None or cut:
         where = f"byte {offset:,}" if offset is not None and not cut else "the end of what can be decompressed"
-        raise intakes.FileCut(f"ends in the middle of a record, at {where}; what stands before is imported")
+        intake.cut(path, f"ends in the middle of a record, at {where}; what stands before is imported")
 
 
 FORMAT = intakes.ImportFormat(
@@ -298,7 +298,7 @@ class _EventReader:
                 self._own.append(span)
             return span
         self._count += 1
-        span = Span(-self._count, *_named(name, arguments, self._settings), start, end)
+        span = Span(-self._count, self._settings.types.get(name, name), arguments, start, end)
         span.kind = self._settings.kinds.get(span.dtype, "action")
         self._tracks[track].append(span)
         return span
@@ -327,12 +327,6 @@ def _arguments(event: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _observation(name: str, values: object) -> _Give:
     return lambda episode, at: episode.observe(name, values, at)
-
-
-def _named(name: str, parameters: Mapping[str, Any], settings: TraceMap) -> tuple[str, Mapping[str, Any]]:
-    """Return the type and the parameters of a node; a name that is no name of a type is a parameter too."""
-    dtype = settings.types.get(name, name) or "Span"
-    return dtype, parameters if dtype == name and name.isidentifier() else {"name": name, **parameters}
 
 
 def _own_span(
@@ -449,15 +443,15 @@ class _Trace:
             self._root, self._description, self.status = key, name, str(own.get("status", "UNKNOWN"))
             return None
         if "kind" in own:
-            own["failure"] = [own.get("reason"), own.get("message")] if "reason" in own else None
             span = _own_span({**own, "node": key, "parent": parent}, name, attributes, start, end, has_objects=False)
         else:
-            span = Span(key, *_named(name, attributes, settings), start, end, parent=parent)
+            span = Span(key, settings.types.get(name, name), attributes, start, end, parent=parent)
             span.kind = settings.kinds.get(span.dtype, "action")
             span.status, span.failure = _outcome(raw, settings)
         span.instants = [
             (_time(_whole(each.get("timeUnixNano"))) or start, str(each.get("name") or "event"), _attributes(each))
             for each in _items([raw], "events")
+            if "kind" not in own or each.get("name") != "exception"  # our own export has the failure twice
         ]
         self.spans[key] = span
         return None

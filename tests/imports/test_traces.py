@@ -1,0 +1,252 @@
+"""Traces of Chrome, Perfetto and OpenTelemetry, and our own exports of both, become episodes."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.events.types import PoseValue
+from pycrorm_async.imports.intake import TYPES_MAX
+from pycrorm_async.world.pose import Pose
+from tests.commands import COMMAND, environment, one_line_of, pycrorm
+from tests.databases import ask
+from tests.imports.importing import imported, poses, tree
+
+AT = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def recorded_walk(url: str) -> None:
+    """Record an episode with every status, overlapping branches, two objects, results and observations."""
+    with Memory.sync(url) as memory:
+        drive = memory.recording.type("action", "NavigateAction", {"target_location": "pose", "speed": "real"})
+        pick = memory.recording.type("action", "PickUpAction", {"object_designator": "object", "arm": "enum"})
+        both = memory.recording.type("language", "Parallel")
+        with memory.recording.episode(description="a walk", id="walk", at=AT) as episode:
+            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]), {"wheel": 0.5}, at=AT + 1)
+            episode.object_added("m", "milk", "MILK", Pose([1, 2, 0.5], [0, 0, 1, 0]), at=AT + 2)
+            episode.start("both", both, at=AT + MS, robot="base")
+            episode.start(
+                "a", drive, {"target_location": Pose([1, 0.25, 0]), "speed": 0.5}, parent="both", at=AT + 2 * MS
+            )
+            episode.start("b", pick, {"object_designator": "m", "arm": "LEFT"}, parent="both", at=AT + 3 * MS)
+            episode.object_moved("base", PoseValue((0.1, 0.2, 0.3), (0, 0, 0, 1), "map", 0), node="a", at=AT + 4 * MS)
+            episode.joints_moved("base", {"wheel": 1.25}, at=AT + 4 * MS + 1)
+            episode.observe("slip", {"left": 0.8, "words": ["a", "b"]}, node="a", at=AT + 5 * MS)
+            episode.end("a", "FAILED", ("WheelSlipped", "the left one"), at=AT + 6 * MS)
+            episode.end("b", "SUCCEEDED", result={"grip_n": 5.5}, at=AT + 7 * MS)
+            for key, status in enumerate(("ERROR", "CANCELLED", "INTERRUPTED", "UNKNOWN")):
+                episode.start(key, drive, {"speed": float(key)}, parent="both", at=AT + (8 + key) * MS)
+                episode.end(key, status, at=AT + (8 + key) * MS)  # type: ignore[arg-type]
+            episode.object_removed("m", at=AT + 20 * MS)
+            episode.end("both", "FAILED", ("ChildFailed", ""), at=AT + 21 * MS)
+            episode.close(status="FAILED", at=AT + 22 * MS)
+        memory.flush()
+
+
+@pytest.mark.parametrize("file_format", ["trace", "otlp"])
+def test_an_import_of_our_own_export_has_the_same_tree_statuses_times_and_poses(
+    tmp_path: Path, file_format: str
+) -> None:
+    source = tmp_path / "source.db"
+    recorded_walk(f"sqlite:///{source}")
+    file = tmp_path / "walk.json"
+    done = pycrorm("export", "1", "--format", file_format, "--out", file, "--url", f"sqlite:///{source}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    if file_format == "otlp":  # it has no objects, so that the field of the object keeps a name, of another type
+        content = file.read_text().replace('"object_designator"', '"object_name"')
+        file.write_text(content)
+    report = imported(tmp_path, "trace", file)
+    before, after = tree(source), tree(tmp_path / "memory.db")
+    assert len(before) == 7
+    assert after == before
+    assert [each.statuses.total() for each in report.episodes] == [7]
+    assert not report.left_out
+    if file_format == "trace":
+        assert poses(tmp_path / "memory.db") == poses(source)
+        assert len(poses(source)) == 3
+    for kind, field in (("Observed", "values"), ("NodeEnded", "result"), ("EpisodeEnded", "status")):
+        query = f"SELECT json_extract(payload, '$.{field}') FROM event WHERE type = '{kind}'"
+        assert ask(tmp_path / "memory.db", query) == ask(source, query)
+
+
+def trace_of(*events: dict[str, Any]) -> str:
+    return json.dumps({"traceEvents": [{"pid": 1, "tid": 1, **each} for each in events]})
+
+
+def test_spans_of_a_thread_nest_and_its_instants_and_counters_are_observations(tmp_path: Path) -> None:
+    file = tmp_path / "run.json.gz"
+    events: list[dict[str, Any]] = [
+        {"ph": "M", "name": "thread_name", "args": {"name": "main"}},
+        {"ph": "B", "name": "fetch milk", "ts": 10, "args": {"tries": 2}},
+        {"ph": "X", "name": "Drive", "ts": 12, "dur": 3.5, "args": {"x": 1.5}},
+        {"ph": "i", "name": "bump", "ts": 13, "args": {"force": 3}},
+        {"ph": "C", "name": "volts", "ts": 14, "args": {"cell": 4.1}},
+        {"ph": "E", "ts": 20, "args": {"found": True}},
+        {"ph": "X", "name": "Drive", "ts": 20, "dur": 1, "tid": 2},
+        {"ph": "b", "cat": "io", "id": "0x1", "name": "Load", "ts": 15},
+        {"ph": "s", "name": "arrow", "ts": 15, "id": 4},
+        {"ph": "E", "ts": 1},
+        {"ph": "X", "name": "Drive", "ts": "noon", "dur": 1},
+        {"ph": "X", "name": "Drive", "ts": 1, "dur": -5},
+    ]
+    file.write_bytes(gzip.compress(trace_of(*events).encode()))
+    (tmp_path / "map.toml").write_text(
+        'start = 2023-11-14T22:13:20Z\ntags = ["lab"]\n'
+        '[types]\n"fetch milk" = "FetchAction"\n[kinds]\nDrive = "motion"\n'
+    )
+    report = imported(tmp_path, "trace", file, map_file=tmp_path / "map.toml")
+    us = AT // 1000
+    assert [(*row[:4], *row[6:]) for row in tree(tmp_path / "memory.db")] == [
+        ("FetchAction", None, "action", "UNKNOWN", us + 10, us + 20),
+        ("Drive", "FetchAction", "motion", "UNKNOWN", us + 12, us + 15),
+        ("Load", None, "action", "UNKNOWN", us + 15, None),
+        ("Drive", None, "motion", "UNKNOWN", us + 20, us + 21),
+    ]
+    observed = "SELECT observation.name, node.dtype FROM observation JOIN task_tree_node AS node ON node.id = node_id"
+    assert sorted(ask(tmp_path / "memory.db", observed)) == [("bump", "Drive"), ("volts", None)]
+    assert {what: count for (what, _), count in report.left_out.items()} == {
+        "flow events": 1,
+        "ends of spans": 1,
+        "events": 1,
+        "spans": 1,
+    }
+    assert ask(tmp_path / "memory.db", "SELECT tries, found FROM fetch_action") == [(2.0, 1)]
+
+
+def test_spans_of_opentelemetry_become_one_episode_for_each_trace(tmp_path: Path) -> None:
+    def span(trace: str, key: str, name: str, begin: int, end: int | None, **further: Any) -> dict[str, Any]:
+        times = {"startTimeUnixNano": str(AT + begin), **({"endTimeUnixNano": str(AT + end)} if end else {})}
+        return {"traceId": trace, "spanId": key, "name": name, **times, **further}
+
+    exception = {
+        "name": "exception",
+        "timeUnixNano": str(AT + 6000),
+        "attributes": [
+            {"key": "exception.type", "value": {"stringValue": "GripLost"}},
+            {"key": "exception.message", "value": {"stringValue": "it fell"}},
+        ],
+    }
+    spans = [
+        span("AA", "02", "grasp", 5000, 7000, parentSpanId="01", status={"code": 2}, events=[exception]),
+        span(
+            "AA", "01", "serve", 1000, 9000, status={"code": 1}, attributes=[{"key": "n", "value": {"intValue": "3"}}]
+        ),
+        span("AA", "03", "early", 0, 500, parentSpanId="01"),
+        span("BB", "01", "other", 0, None, parentSpanId="ff"),
+        span("BB", "01", "twice", 0, 1),
+    ]
+    line = json.dumps({"resourceSpans": [{"scopeSpans": [{"spans": spans}]}]})
+    (tmp_path / "spans.jsonl").write_text(line + "\n" + line[:50])
+    report = imported(tmp_path, "trace", tmp_path / "spans.jsonl")
+    us = AT // 1000
+    assert tree(tmp_path / "memory.db", 1) == [
+        ("serve", None, "action", "SUCCEEDED", None, None, us + 1, us + 9),
+        ("early", "serve", "action", "UNKNOWN", None, None, us, us + 0),
+        ("grasp", "serve", "action", "FAILED", "GripLost", "it fell", us + 5, us + 7),
+    ]
+    assert tree(tmp_path / "memory.db", 2) == [("other", None, "action", "UNKNOWN", None, None, us, None)]
+    assert {what: count for (what, _), count in report.left_out.items()} == {"parents of spans": 1, "spans": 1}
+    [cut] = report.cut
+    assert f"spans.jsonl ends in the middle of a record, at byte {len(line) + 1:,}; what stands before" in cut
+
+
+@pytest.mark.parametrize("rest", ["", ",\n", ',\n{"ph": "X", "na'])
+def test_a_list_without_its_last_bracket_is_whole_and_one_cut_inside_an_event_is_not(tmp_path: Path, rest: str) -> None:
+    event = json.dumps({"ph": "X", "name": "Drive", "ts": 0, "dur": 5, "pid": 1, "tid": 1})
+    (tmp_path / "t.json").write_text(f"[{event},{event}{rest}")
+    report = imported(tmp_path, "trace", tmp_path / "t.json")
+    assert [each.nodes for each in report.episodes] == [2]
+    assert len(report.cut) == rest.count("{")
+
+
+def test_hostile_names_and_thousands_of_them_make_few_types_and_no_faults(tmp_path: Path) -> None:
+    names = [
+        "'; DROP TABLE event; --",
+        "\x1b[2J",
+        "größe",
+        "9 lives",
+        "",
+        "select",
+        "a" * 500,
+        *map("n{}".format, range(300)),
+    ]
+    arguments = {"; x": 1, "kind": "k", "a.b": "c", "a b": "d", **{f"f{n}": n for n in range(100)}}
+    events = [
+        {"ph": "X", "name": name, "ts": index * 10, "dur": 5, "args": arguments if index == 0 else {}}
+        for index, name in enumerate(names)
+    ]
+    (tmp_path / "t.json").write_text(trace_of(*events))
+    report = imported(tmp_path, "trace", tmp_path / "t.json")
+    dtypes = {row[0] for row in tree(tmp_path / "memory.db")}
+    assert report.episodes[0].nodes == len(names)
+    assert len(dtypes) == TYPES_MAX
+    assert ask(tmp_path / "memory.db", "SELECT count(*) FROM task_tree_node") == [(len(names) + 1,)]
+    done = pycrorm("verify", "--url", f"sqlite:///{tmp_path}/memory.db", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_same_file_twice_is_stored_once_and_another_name_in_the_map_stores_it_again(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text(trace_of({"ph": "X", "name": "Drive", "ts": 0, "dur": 5}))
+    imported(tmp_path, "trace", tmp_path / "t.json")
+    again = imported(tmp_path, "trace", tmp_path / "t.json")
+    assert [each.state for each in again.episodes] == ["already stored"]
+    (tmp_path / "map.toml").write_text('name = "second"')
+    imported(tmp_path, "trace", tmp_path / "t.json", map_file=tmp_path / "map.toml")
+    assert ask(tmp_path / "memory.db", "SELECT count(*) FROM process_metadata") == [(2,)]
+
+
+@pytest.mark.slow
+def test_an_import_that_is_killed_and_started_again_doubles_nothing_and_misses_nothing(tmp_path: Path) -> None:
+    events = [{"ph": "X", "name": "Drive", "ts": n * 10, "dur": 5, "args": {"n": n}} for n in range(30_000)]
+    (tmp_path / "t.json").write_text(trace_of(*events))
+    command = [*COMMAND, "import", "trace", "t.json", "--url", "sqlite:///memory.db"]
+    for _ in range(2):
+        with subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.DEVNULL) as started:
+            segments = tmp_path / "memory.db.spool"
+            while not any(each.stat().st_size for each in segments.rglob("*.segment")) and started.poll() is None:
+                time.sleep(0.01)
+            time.sleep(0.3)
+            os.kill(started.pid, signal.SIGKILL)
+    done = pycrorm("import", "trace", "t.json", "--url", "sqlite:///memory.db", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    [episode] = json.loads(done.stdout)["episodes"]
+    assert (episode["state"], episode["nodes"]) == ("imported", 30_000)
+    numbers = ask(tmp_path / "memory.db", "SELECT n FROM drive ORDER BY id")
+    assert [int(n) for (n,) in numbers] == list(range(30_000))
+    assert ask(tmp_path / "memory.db", "SELECT status FROM process_metadata") == [("UNKNOWN",)]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["smoke", "t.json"], "there is no format 'smoke'"),
+        (["trace", "none.json"], "none.json does not exist"),
+        (["trace", "."], "is a folder: name the trace files in it"),
+        (["trace", "words.txt"], "words.txt is no trace in JSON"),
+        (["trace", "other.json"], "is no whole trace in JSON: it has neither traceEvents nor resourceSpans"),
+        (["trace", "t.json", "--map", "none.toml"], "the map file none.toml cannot be read: No such file or directory"),
+        (["trace", "t.json", "--map", "wrong.toml"], "unknown field `strat`; keys of this format: name, description"),
+        (["trace", "t.json", "--map", "words.txt"], "the map file words.txt does not fit"),
+    ],
+)
+def test_a_wrong_call_or_file_is_one_line_and_leaves_nothing(tmp_path: Path, words: list[str], line: str) -> None:
+    (tmp_path / "t.json").write_text(trace_of({"ph": "X", "name": "Drive", "ts": 0, "dur": 5}))
+    (tmp_path / "words.txt").write_text("no trace at all")
+    (tmp_path / "other.json").write_text('{"a": [1]}')
+    (tmp_path / "wrong.toml").write_text("strat = 3")
+    for option in ([], ["--dry-run"]):
+        done = pycrorm("import", *words, *option, "--url", "sqlite:///memory.db", cwd=tmp_path)
+        assert done.returncode == 2
+        assert line in one_line_of(done)
+    rows = ask(tmp_path / "memory.db", "SELECT count(*) FROM event") if (tmp_path / "memory.db").exists() else [(0,)]
+    assert rows == [(0,)]
