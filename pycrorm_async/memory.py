@@ -64,6 +64,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import AskedEpisode, Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading, memory_html
+from pycrorm_async.query.samples import samples
 from pycrorm_async.query.success import plot_success
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
@@ -558,6 +559,7 @@ class Memory:
     blob = _reading(Reading.blob)
     number_of = _reading(Reading.number_of)
     plot_success = _reading(plot_success)
+    samples = _reading(samples)
 
     @property
     def ask(self) -> Ask[Question]:
@@ -922,4 +924,5 @@ class SyncMemory:
     report = _awaited(Memory.report)
     picture = _awaited(Memory.picture)
     plot_success = _awaited(Memory.plot_success)
+    samples = _awaited(Memory.samples)
     export = _awaited(Memory.export)

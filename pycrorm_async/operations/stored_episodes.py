@@ -6,13 +6,17 @@ A recording has no event loop of its own and may be called inside one, so each q
 from __future__ import annotations
 
 import asyncio
+import mmap
 import threading
 import time
 from collections.abc import Collection, Coroutine, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from pycrorm_async.errors import FlushTimeout
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.format import segment_numbers, segment_path
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.record.recorded_before import StoredEpisode, StoredPayload
@@ -32,7 +36,7 @@ class LogEpisodes:
     Args:
         queue: the memory's own queue, all of whose records must be stored before the log is read.
         unrecoverable: the names of folders of dead recorders that nobody can drain.
-        timeout_s: bounds the wait for the queue, and for the folders of dead recorders.
+        timeout_s: bounds the wait for the queue, and for the folders of other recorders.
     """
 
     def __init__(
@@ -51,8 +55,8 @@ class LogEpisodes:
         self._timeout_s = timeout_s
 
     def find(self, episode: EpisodeId) -> StoredEpisode | None:
-        """Implement `StoredEpisodes.find`. Raises `FlushTimeout` if the writer stores nothing for too long."""
-        self._wait_until_stored()
+        """Implement `StoredEpisodes.find`. Raises `FlushTimeout` if another recorder keeps events of the episode."""
+        self._wait_until_stored(episode)
         row = _run(self._row(episode))
         if row is None:
             return None
@@ -63,20 +67,19 @@ class LogEpisodes:
             lambda after: _run(self._page(number, after, min(head, after + _PAGE_EVENTS))),
         )
 
-    def _wait_until_stored(self) -> None:
+    def _wait_until_stored(self, episode: EpisodeId) -> None:
         position, deadline = self._queue.written, time.monotonic() + self._timeout_s
-        while self._queue.stored < position or self._dead_recorders():
-            if time.monotonic() > deadline:
-                raise FlushTimeout(self._timeout_s)
-            time.sleep(_PAUSE_S)
-
-    def _dead_recorders(self) -> list[str]:
-        """List the folders that a writer is about to drain; dead letters are none, because the log refused them."""
-        return [
-            each.name
-            for each in self._spool.recorders()
-            if not each.alive and each.refused is None and each.name not in self._unrecoverable
+        others = [
+            each.path
+            for each in self._spool.recorders()  # without dead letters, which the log refuses again and again
+            if each.path != self._queue.folder and each.refused is None and each.name not in self._unrecoverable
         ]
+        while self._queue.stored < position or (others := [each for each in others if _holds(each, episode)]):
+            if time.monotonic() > deadline:
+                holders = ", ".join(each.name for each in others)
+                reason = f"another process records this episode: recorder {holders}" if others else None
+                raise FlushTimeout(self._timeout_s, reason)
+            time.sleep(_PAUSE_S)
 
     async def _row(self, episode: EpisodeId) -> tuple[int, int, int | None] | None:
         log = await EventLog.open(self._address, create=False)
@@ -93,6 +96,23 @@ class LogEpisodes:
         finally:
             await log.close()
         return [StoredPayload(each.sequence, each.type, each.version, each.payload) for each in events]
+
+
+def _holds(folder: Path, episode: EpisodeId) -> bool:
+    """Return whether a recorder's folder has events of an episode; its files may be deleted meanwhile.
+
+    Its locks do not answer that, because a writer that drains the folder of a dead recorder holds them too.
+    """
+    with suppress(FileNotFoundError):
+        for number in segment_numbers(folder):
+            with (
+                suppress(FileNotFoundError, ValueError),
+                segment_path(folder, number).open("rb") as file,
+                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+            ):
+                if content.find(episode) >= 0:
+                    return True
+    return False
 
 
 def _run(coroutine: Coroutine[Any, Any, T]) -> T:

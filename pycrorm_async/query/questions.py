@@ -47,6 +47,7 @@ from pycrorm_async.query import frames
 from pycrorm_async.query.named_queries import EpisodeChoice, episode_list
 from pycrorm_async.query.question import CHECKED, AskedEpisode, QuestionPlan, classes_meant_by
 from pycrorm_async.query.text import nearest
+from pycrorm_async.record.samples import SAMPLES
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
@@ -800,6 +801,32 @@ class Ask(Generic[Q]):
         return frames.limited(statement, limit)
 
     # --- episodes ---------------------------------------------------------------------------------------------
+
+    @_Question
+    @staticmethod
+    def streams(*, episode: Of = None, limit: Limit = None) -> Rows:
+        """List the streams of samples, such as joint states, with the numbers of their channels and samples.
+
+        `memory.samples(stream)` returns one as a frame.
+        """
+        observation, block = orm.Observation, aliased(orm.ObservationValue)
+        count, channels = aliased(orm.ObservationValue), aliased(orm.ObservationValue)
+        statement = (
+            sa.select(
+                observation.process_metadata_id.label("episode"),
+                observation.name.label("stream"),
+                sa.cast(sa.func.max(channels.number), sa.Integer).label("channels"),
+                sa.cast(sa.func.sum(count.number), sa.Integer).label("samples"),
+                sa.func.max(observation.time).label("time"),
+            )
+            .join(block, (block.id == observation.id) & (block.media_type == SAMPLES))
+            .join(count, (count.id == observation.id) & (count.key == "samples"))
+            .join(channels, (channels.id == observation.id) & (channels.key == "channels"))
+            .where(frames.of_episode(observation.process_metadata_id, episode))
+            .group_by(observation.process_metadata_id, observation.name)
+            .order_by(observation.process_metadata_id, observation.name)
+        )
+        return frames.limited(statement, limit)
 
     @_Question
     @staticmethod

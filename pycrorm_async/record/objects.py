@@ -16,6 +16,7 @@ from typing import Any, Generic, TypeVar
 
 from pycrorm_async.events import types as event_types
 from pycrorm_async.record.episode_writer import EpisodeWriter
+from pycrorm_async.record.frames import Frames
 from pycrorm_async.record.geometry import ReadDescription
 from pycrorm_async.record.values import PoseLike, recorded_as
 
@@ -106,13 +107,14 @@ class RecordedObject:
 
 
 class RecordedObjects(ObjectRows[Hashable]):
-    """The objects of one episode."""
+    """The objects of one episode; `frames` are the places of their frames, and of others that the executive states."""
 
     def __init__(self, episode: EpisodeWriter) -> None:
         super().__init__(episode)
         self._objects: dict[Hashable, RecordedObject] = {}
         self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
         self._identities: set[int] = set()
+        self.frames = Frames()
 
     def holds(self, reference: event_types.ObjectReference | None) -> bool:
         """Return whether this episode has such a row; True for None."""
@@ -145,6 +147,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         """Write that an object entered the world; for a known key, write its new pose and joints."""
         if key in self._references:
             return max(self.move(key, added.pose, node), self.turn(key, added.joints, node))
+        added.pose = self.frames.in_map(added.pose)
         sequence = self._put(
             lambda: event_types.ObjectAdded(
                 added.name,
@@ -163,13 +166,14 @@ class RecordedObjects(ObjectRows[Hashable]):
         )
         if sequence:
             self._objects[key] = added
+            self.frames.place(added.name, added.pose)
             self._identities.add(sequence)
         return sequence
 
     def move(self, key: Hashable, pose: event_types.PoseValue, node: int | None) -> int:
         """Write a new pose of an object, if it has changed."""
         state, reference = self._objects[key], self._references[key]
-        last = state.pose
+        last, pose = state.pose, self.frames.in_map(pose)
         if _are_at_one_place(pose, last):
             return 0
         sequence = self._put(
@@ -178,6 +182,7 @@ class RecordedObjects(ObjectRows[Hashable]):
             identity=reference.object,
         )
         state.pose = pose if sequence else last
+        self.frames.place(state.name, state.pose)
         return sequence
 
     def turn(self, key: Hashable, positions: Mapping[str, float], node: int | None) -> int:

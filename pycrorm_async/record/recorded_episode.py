@@ -21,11 +21,19 @@ from pycrorm_async.events.reasons import UNNAMED, template_of
 from pycrorm_async.events.types import ObjectDetected
 from pycrorm_async.record.arguments import ArgumentReader, Convert, RecordedValues, pose_of, struct_of
 from pycrorm_async.record.declarations import DeclaredType
-from pycrorm_async.record.episode_writer import Emitter, EpisodeWriter, OpenEpisodes, is_of_memory, put_observation
+from pycrorm_async.record.episode_writer import (
+    Emitter,
+    EpisodeWriter,
+    OpenEpisodes,
+    is_of_memory,
+    name_of,
+    put_observation,
+)
 from pycrorm_async.record.event_times import At, EventTimes
 from pycrorm_async.record.objects import RecordedObjects
 from pycrorm_async.record.opening import EpisodeOpening, Failures, end_statuses
 from pycrorm_async.record.recorded_before import RecordedBefore, StoredEpisode, StoredEpisodes
+from pycrorm_async.record.samples import SampleBlocks, sampled_values
 from pycrorm_async.record.values import (
     PoseLike,
     clean_repr,
@@ -214,6 +222,7 @@ class RecordedEpisode(EpisodeWriter):
         self._objects = RecordedObjects(self)
         self._values = RecordedValues(convert, self._objects)
         self._arguments = ArgumentReader(emitter.missing)
+        self._samples = SampleBlocks()
 
     def __enter__(self) -> Self:
         return self
@@ -342,6 +351,7 @@ class RecordedEpisode(EpisodeWriter):
             return None
         if isinstance(robot, event_types.RobotValue):
             state = struct_of(robot, event_types.RobotValue)
+            state = replace(state, pose=self._objects.frames.in_map(state.pose))
             return state if self._objects.holds(state.object) else replace(state, object=None)
         if (acting := self._objects.robot(robot)) is None:
             raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
@@ -511,6 +521,16 @@ class RecordedEpisode(EpisodeWriter):
         copied = pose_of(pose)
         return self._timed("ObjectMoved", at, lambda: self._objects.move(self._known(key), copied, self._cause(node)))
 
+    @reported("a frame")
+    def frame_moved(self, frame: str, pose: PoseLike | event_types.PoseValue) -> Callable[[], object]:
+        """State where a frame is, in the frame of this pose. Records nothing itself.
+
+        Poses of objects, percepts and robots in this frame are recorded in the map from now on, if that frame's place
+        is known too. Those of objects are known by their names.
+        """
+        name, copied = str(frame), pose_of(pose)
+        return lambda: self._objects.frames.place(name, copied)
+
     @reported("JointsMoved")
     def joints_moved(
         self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None, at: At | None = None
@@ -577,6 +597,49 @@ class RecordedEpisode(EpisodeWriter):
 
         return self._timed("Observed", at, write)
 
+    @reported("Observed")
+    def sampled(
+        self,
+        key: Hashable,
+        channels: Sequence[str],
+        values: Any,
+        at: int | Sequence[int] | None = None,
+        *,
+        node: Hashable | None = None,
+    ) -> Callable[[], object]:
+        """Record samples of a stream, such as joint states or the pose of a frame, in blocks (`record.samples`).
+
+        >>> episode.sampled("joint_states", ["shoulder", "elbow"], [0.1, -0.4], at=stamp_ns)
+        >>> episode.sampled("joint_states", ["shoulder", "elbow"], array_of_n_times_2, at=n_stamps)
+
+        `Memory.samples` returns them as a frame. Up to five seconds of a stream are in memory only, until their block
+        is written.
+
+        Args:
+            key: the name of the stream.
+            channels: the names of the numbers.
+            values: the numbers of one sample, or an array of a row for each sample; NaN where there is none.
+            at: the wall time of the sample, or of each, UTC in ns.
+        """
+        name = name_of(key)
+        stamps = self._now_ns() if at is None else at
+        names, numbers, times = sampled_values(channels, values, stamps)
+
+        def write() -> None:
+            last = int(times[-1]) if len(times) else 0
+            if self.time is not None and last > self.time[0]:  # streams overlap, so that others may be ahead
+                self._set_time("Observed", last)
+            for sampling, block in self._samples.add(name, names, numbers, times, node):
+                self._put_block(name, sampling, block)
+
+        return write
+
+    def _put_block(self, name: str, node: Hashable | None, block: dict[str, Any]) -> None:
+        put_observation(self, name, block, self.node_or_root(self._find(node, "Observed")), may_refuse=False)
+
+    def _now_ns(self) -> int:
+        return self._episodes.clock.wall_ns() if self.time is None else self.time[0]
+
     @reported("ObjectDetected")
     def detected(
         self,
@@ -595,7 +658,8 @@ class RecordedEpisode(EpisodeWriter):
         def write() -> int:
             acting = self._find(node, "ObjectDetected")
             number = self.node_or_root(acting) if acting is not None else None
-            held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
+            placed = (replace(each, pose=self._objects.frames.in_map(each.pose)) for each in percepts)
+            held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in placed)
             return self.put(replace(event, seen=tuple(held), node=number))
 
         return self._timed("ObjectDetected", at, write)
@@ -662,6 +726,8 @@ class RecordedEpisode(EpisodeWriter):
             return
         if not self.closed:
             self._set_time("EpisodeEnded", self._end_at)
+            for name, node, block in self._samples.take_all():
+                self._put_block(name, node, block)
         if (left := len(self._nodes)) and failure is None and not self.closed and self._end_status != "UNKNOWN":
             self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {left}")
         super().end_episode(failure, world)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -16,6 +17,8 @@ import pytest
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import episode_text, named_episode_id
+from pycrorm_async.events.types import SeenValue
+from pycrorm_async.record.arguments import pose_of
 from pycrorm_async.record.event_times import At
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.world.pose import Pose
@@ -187,7 +190,7 @@ def test_a_killed_recording_of_a_name_is_continued_and_nothing_is_doubled(tmp_pa
         "import sys; from pycrorm_async import Memory; from tests.record.test_given_times import record_drives, opened;"
         "from pathlib import Path\n"
         "with opened(Path(sys.argv[1])) as memory:\n"
-        "    record_drives(memory.recording, 'drives.log', 20_000)\n"
+        "    record_drives(memory.recording, 'drives.log', 6_000)\n"
     )
     whole = tmp_path / "whole"
     whole.mkdir()
@@ -198,7 +201,7 @@ def test_a_killed_recording_of_a_name_is_continued_and_nothing_is_doubled(tmp_pa
     with opened(killed):
         pass
     heads = [0]
-    for _ in range(3):
+    for _ in range(2):
         process = subprocess.Popen([sys.executable, "-c", program, str(killed)], cwd=Path(__file__).parents[2])
         while len(rows(killed, "SELECT 1 FROM event")) <= heads[-1] + 200:
             assert process.poll() is None
@@ -206,14 +209,14 @@ def test_a_killed_recording_of_a_name_is_continued_and_nothing_is_doubled(tmp_pa
         process.wait()
         heads.append(len(rows(killed, "SELECT 1 FROM event")))
     with opened(killed) as memory:
-        episode = record_drives(memory.recording, "drives.log", 20_000)
+        episode = record_drives(memory.recording, "drives.log", 6_000)
         assert episode.refusal is None
         assert memory.status.faults.total == 0
     assert_verified(killed)
     assert contents(killed)[:2_000] == contents(whole)[:2_000]
-    assert rows(killed, "SELECT count(*), count(DISTINCT json_extract(parameters, '$.goal')) FROM task_tree_node") == [
-        (20_001, 20_000)
-    ]
+    nodes = "SELECT count(*), count(DISTINCT payload) FROM event WHERE type = 'NodeStarted'"
+    assert rows(killed, nodes) == [(6_001, 6_001)]
+    assert rows(killed, "SELECT count(*) FROM task_tree_node") == [(6_001,)]
     assert rows(killed, "SELECT status FROM process_metadata") == [("SUCCEEDED",)]
 
 
@@ -239,3 +242,36 @@ async def test_a_name_is_found_inside_a_running_loop(tmp_path: Path) -> None:
     for turn in range(2):
         async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
             assert record_drives(memory.recording, "drives.log", 3).is_recorded == (turn == 1)
+
+
+# === frames ===================================================================================================
+
+
+def test_a_pose_in_a_frame_whose_place_is_known_is_recorded_in_the_map(tmp_path: Path) -> None:
+    quarter = [0, 0, math.sqrt(0.5), math.sqrt(0.5)]
+    with opened(tmp_path) as memory, memory.recording.episode(description="frames") as episode:
+        episode.object_added("robot", "pr2", "ROBOT", Pose([1, 2, 0], quarter))
+        episode.frame_moved("camera", Pose([0.5, 0, 1], frame="pr2"))
+        episode.object_added("cup", "cup", "CUP", Pose([2, 0, 0], frame="camera"))
+        episode.object_added("lost", "lost", "CUP", Pose([2, 0, 0], frame="gripper"))
+        episode.detected([SeenValue("cup", "CUP", pose_of(Pose([0, 1, 0], frame="pr2")))])
+        episode.object_moved("cup", Pose([1, 0, 0], frame="camera"))
+        episode.frame_moved("a", Pose([0, 0, 0], frame="b"))
+        episode.frame_moved("b", Pose([0, 0, 0], frame="a"))
+        episode.object_moved("cup", Pose([9, 9, 9], frame="a"))
+    assert_verified(tmp_path)
+    places = [
+        (name, round(x, 9), round(y, 9), round(z, 9), frame)
+        for name, x, y, z, frame in rows(
+            tmp_path, "SELECT name, x, y, z, frame FROM object JOIN pose ON pose.id = pose_id ORDER BY object.id"
+        )
+    ]
+    assert places == [
+        ("pr2", 1, 2, 0, "map"),
+        ("cup", 1, 4.5, 1, "map"),
+        ("lost", 2, 0, 0, "gripper"),
+        ("cup", 1, 3.5, 1, "map"),
+        ("cup", 9, 9, 9, "a"),
+    ]
+    [(x, y, frame)] = rows(tmp_path, "SELECT round(x, 9), round(y, 9), frame FROM detection")
+    assert (x, y, frame) == (0, 2, "map")
