@@ -39,7 +39,9 @@ def environment() -> dict[str, str]:
     return kept | {"COLUMNS": "200", "PYTHONPATH": str(Path(__file__).parent.parent), "NO_COLOR": "1"}
 
 
-_VERBS = "ask copy demo diff episodes events export import_ learn query rebuild run show spool status verify writer".split()
+_VERBS = (
+    "ask copy demo diff episodes events export import_ learn query rebuild run show spool status verify writer"
+).split()
 _PROGRAM = [f"pycrorm_async.cli.{name}" for name in ("main", *_VERBS)]
 _LOADED = ["tests.no_collections", *_PROGRAM, "tests.commands", "tests.preloaded"]
 _starting = threading.Lock()
