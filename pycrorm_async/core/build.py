@@ -1,7 +1,7 @@
 """Compile `_core.c` when the package is installed; without a compiler it installs all the same, and runs slower.
 
 Hatchling runs the hook for each wheel, also for that of an editable install, which gets the library beside its source.
-`python -m pycrorm_async.core.build` compiles it there again after a change of the C file.
+`python pycrorm_async/core/build.py` compiles it there again after a change of the C file.
 """
 
 from __future__ import annotations

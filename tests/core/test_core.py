@@ -406,4 +406,4 @@ def test_a_compiler_that_fails_is_reported_in_one_line(tmp_path: Path, monkeypat
 @compiled
 def test_the_compiled_core_that_these_tests_load_is_that_of_the_source() -> None:
     source = (ROOT / "pycrorm_async/core/_core.c").read_bytes()
-    assert hashlib.sha256(source).hexdigest() == c_core().SOURCE, "run `python -m pycrorm_async.core.build`"
+    assert hashlib.sha256(source).hexdigest() == c_core().SOURCE, "run `python pycrorm_async/core/build.py`"
