@@ -24,7 +24,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from rich.table import Table
 
@@ -34,7 +34,7 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.codec import Heading, encode
 from pycrorm_async.events.ids import EpisodeId, episode_id
-from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted, RobotValue
 from pycrorm_async.plan import BaseMotion
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.plan.task import TaskTreeNode
@@ -162,7 +162,9 @@ def _parts(action: NothingActionPerformable, queue: RecorderQueue, memory: Memor
     def parameters() -> dict[str, Any]:
         return read_parameters(action, declared.fields, episode, {})
 
-    start = NodeStarted("action", 2, declared.fingerprint, parameters(), world.robot())
+    robot = world.robot()
+    assert robot is not None
+    start = NodeStarted("action", 2, declared.fingerprint, parameters(), cast("RobotValue", robot.written))
     payload = encode(start)
     name = _identity(b"episode...")
     queue.put_nowait(Heading(name, "EpisodeStarted", 1), encode(EpisodeStarted("bench", "", "", "", "")))

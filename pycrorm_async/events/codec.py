@@ -40,8 +40,19 @@ from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared, Designa
 
 Upcaster: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 
-UPCASTERS: Final[Mapping[tuple[str, int], Upcaster]] = {}
-"""Upcasters by event type and old version; empty while every shape is at version 1."""
+
+def unchanged(old: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON of a shape that the next version reads as it is, because it only allows more."""
+    return old
+
+
+UPCASTERS: Final[Mapping[tuple[str, int], Upcaster]] = {
+    # Version 2 omits frame and orientation of a pose where they are the default, and in NodeStarted the robot's pose
+    # where its object's row has it.
+    **{(name, 1): unchanged for name in ("ObjectAdded", "ObjectMoved", "LocationResolved", "ObjectDetected")},
+    ("NodeStarted", 1): unchanged,
+}
+"""Upcasters by event type and old version."""
 
 
 # === codec ====================================================================================================
@@ -79,6 +90,11 @@ class Decoder:
         self._upcasters = dict(upcasters)
         older = {(name, each) for name, (version, _) in self._current.items() for each in range(1, version)}
         assert self._upcasters.keys() == older, self._upcasters.keys() ^ older
+        self._readable = dict.fromkeys(self._current, 1)
+        for name, version in older:
+            if self._upcasters[name, version] is not unchanged:
+                self._readable[name] = max(self._readable[name], version + 1)
+        """By event type, the first version from which no upcaster changes anything, so that it is decoded as it is."""
 
     def decode(self, type_name: str, payload: bytes, version: int | None = None) -> Happening:
         """Decode a payload of `version` (None: the current version) into the current shape of its type.
@@ -94,7 +110,8 @@ class Decoder:
             if version != current and version is not None:
                 if not 1 <= version < current:
                     raise UnknownShape(f"{type_name} has version {version}, this version reads {current}")
-                payload = self._upcast(type_name, payload, version, current)
+                if version < self._readable[type_name]:
+                    payload = self._upcast(type_name, payload, version, current)
             try:
                 return decode_current(payload)
             except msgspec.ValidationError:
@@ -179,6 +196,12 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
     return payload
 
 
+def encoded(value: Any) -> msgspec.Raw:
+    """Encode one part of several events once, to be put into each of them. Raises `NotEncodable`."""
+    encoded_bytes(value)
+    return msgspec.Raw(_encoder.encode(value))
+
+
 def encoded_bytes(value: Any) -> int:
     """Return the size in bytes of one part of an event once encoded. Raises `NotEncodable`."""
     fault = _first_fault(value)
@@ -253,7 +276,7 @@ def _first_fault(value: Any, path: str = "") -> NotEncodable | None:
         children = list(value.items())
     elif isinstance(value, list | tuple):
         children = [(str(index), child) for index, child in enumerate(value)]
-    elif value is None or isinstance(value, str | int | float):
+    elif value is None or isinstance(value, str | int | float | msgspec.Raw):  # JSON that `encoded` has checked
         return None
     else:
         return NotEncodable(path, f"JSON cannot hold a {type(value).__name__}")

@@ -42,13 +42,34 @@ class _Value(msgspec.Struct, frozen=True, omit_defaults=True):
     """The base of all parts of a payload."""
 
 
-class PoseValue(_Value, frozen=True):
-    """A copy of a pose: metres, unit quaternion xyzw, frame name, and the time it was created (UTC, ns)."""
+UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
+"""The quaternion of no rotation."""
+MAP: Final = "map"
+"""The frame of nearly all poses."""
+
+
+class PoseValue(_Value, frozen=True, omit_defaults=False):
+    """A copy of a pose: metres, unit quaternion xyzw, frame name, and the time it was created (UTC, ns).
+
+    Its JSON has all fields, because poses in parameters, results and arguments of failures are read by key.
+    """
 
     position: tuple[float, float, float]
-    orientation: tuple[float, float, float, float]
-    frame: str
-    time_ns: int
+    orientation: tuple[float, float, float, float] = UPRIGHT
+    frame: str = MAP
+    time_ns: int = 0
+
+
+class BriefPose(PoseValue, frozen=True, omit_defaults=True):
+    """A pose whose JSON omits the defaults, for the fields of events whose type is a pose."""
+
+    @classmethod
+    def of(cls, pose: PoseValue) -> BriefPose:
+        """Copy a pose. The encoder omits an object that is the default, not one that is equal to it."""
+        position, orientation, frame, time_ns = pose.position, pose.orientation, pose.frame, pose.time_ns
+        if orientation == UPRIGHT and "-" not in repr(orientation):  # -0.0 is equal to 0.0 and not the same number
+            orientation = UPRIGHT
+        return cls(position, orientation, MAP if frame == MAP else frame, time_ns)
 
 
 class ObjectReference(_Value, frozen=True):
@@ -78,11 +99,12 @@ class ObjectValue(_Value, frozen=True):
 class RobotValue(_Value, frozen=True):
     """The robot that acted at the start of a node: base pose, torso joint position in metres (None without torso).
 
-    `name` is that of its object in the world; None in events of older versions.
+    `pose` is None if the row of `object` has it, as that of a robot of the recorded world has: there it is not written
+    again for every node. `name` is that of its object in the world; None in events of older versions.
     """
 
-    pose: PoseValue
-    object_type: str
+    pose: PoseValue | None = None
+    object_type: str = "ROBOT"
     torso_height: float | None = None
     object: ObjectReference | None = None
     name: str | None = None
@@ -386,6 +408,8 @@ class ObjectAdded(Happening, frozen=True):
         base_link: of a robot: the link whose frame has the pose, in all events of this object; None: the root link.
     """
 
+    version = 2
+
     name: str
     object_type: str
     pose: PoseValue
@@ -408,6 +432,8 @@ class ObjectRemoved(Happening, frozen=True):
 
 class ObjectMoved(Happening, frozen=True):
     """An object has a new pose. Recorded once per motion, and for every attached object that the motion carried."""
+
+    version = 2
 
     object: int
     name: str
@@ -457,6 +483,8 @@ class NodeStarted(Happening, frozen=True):
         continues: in a follow-up episode, the sequence that the continued node had in the former episode.
     """
 
+    version = 2
+
     kind: NodeKind
     parent: int | None = None
     designator: str | None = None
@@ -498,6 +526,8 @@ class LocationResolved(Happening, frozen=True):
         cells: the places in its costmaps; None if it has none, and in events of older versions.
     """
 
+    version = 2
+
     location: str
     offered: tuple[CandidateValue, ...] = ()
     taken: int | None = None
@@ -517,6 +547,8 @@ class ObjectDetected(Happening, frozen=True):
         seen: the perceived objects, most visible first.
         node: the node that made the request.
     """
+
+    version = 2
 
     source: Literal["camera", "world_state"]
     object_type: str | None = None

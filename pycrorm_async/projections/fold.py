@@ -225,8 +225,11 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     if started.simulated:
         columns[SIMULATED] = True
     if robot is not None:
-        rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
-        columns[ROBOT_POSE_ID] = node + SLOT_ROBOT_POSE
+        if robot.pose is None:
+            columns[ROBOT_POSE_ID] = robot_object  # a row of an object and its pose have one id
+        else:
+            rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
+            columns[ROBOT_POSE_ID] = node + SLOT_ROBOT_POSE
         columns[TORSO_HEIGHT] = robot.torso_height
         columns[ROBOT_TYPE] = robot.object_type
         columns[ROBOT_OBJECT_ID] = robot_object

@@ -119,6 +119,13 @@ class ReplayedWorld:
             raise CannotFold(f"object {identity} was never added")
         return self.objects.get(identity)
 
+    def pose_of(self, robot: event_types.RobotValue) -> event_types.PoseValue | None:
+        """Return the pose of the robot that starts a node now; None if the world does not have its object."""
+        if robot.pose is not None or robot.object is None:
+            return robot.pose
+        present = self.objects.get(robot.object.object)
+        return present.pose if present is not None else None
+
     def name_of(self, identity: int) -> str | None:
         """Return the name of an object, also of a removed one; None if it was never added."""
         added = self.added.get(identity)

@@ -244,12 +244,13 @@ def situation(
     symbols: Symbols = {}
     numbers: Numbers = {}
     _add_parameters(symbols, numbers, fields, parameters)
+    stands = world.pose_of(robot) if robot is not None else None
     if robot is not None:
-        _add_robot(symbols, numbers, fields, parameters, robot)
+        _add_robot(symbols, numbers, fields, parameters, robot, stands)
     identity = None
     if fields.objects and (value := parameters.get(fields.objects[0])) is not None:
         identity = value.get("object")
-        _add_object(symbols, numbers, _seen(value, world), robot)
+        _add_object(symbols, numbers, _seen(value, world), robot, stands)
     for name in fields.objects[1:]:
         if (value := parameters.get(name)) is not None and (type_ := _seen(value, world).type) is not None:
             symbols[f"{name}_type"] = type_
@@ -273,17 +274,18 @@ def _add_robot(
     fields: FeatureFields,
     parameters: Mapping[str, Any],
     robot: event_types.RobotValue,
+    stands: event_types.PoseValue | None,
 ) -> None:
     if robot.name is not None:
         symbols["robot"] = robot.name
     if robot.torso_height is not None:
         numbers["torso"] = robot.torso_height
+    if stands is None:
+        return
     for name, features in fields.poses:
-        if (value := parameters.get(name)) is not None and value["frame"] == robot.pose.frame:
+        if (value := parameters.get(name)) is not None and value["frame"] == stands.frame:
             x, y, z, yaw = features
-            numbers[x], numbers[y], numbers[z], numbers[yaw] = _pose_in(
-                value["position"], value["orientation"], robot.pose
-            )
+            numbers[x], numbers[y], numbers[z], numbers[yaw] = _pose_in(value["position"], value["orientation"], stands)
 
 
 class _Seen(NamedTuple):
@@ -306,7 +308,13 @@ def _seen(value: Mapping[str, Any], world: ReplayedWorld) -> _Seen:
     return _Seen(present.added.name, present.added.object_type, present.pose)
 
 
-def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: event_types.RobotValue | None) -> None:
+def _add_object(
+    symbols: Symbols,
+    numbers: Numbers,
+    seen: _Seen,
+    robot: event_types.RobotValue | None,
+    stands: event_types.PoseValue | None,
+) -> None:
     if seen.type is not None:
         symbols["object_type"] = seen.type
     if seen.name is not None:
@@ -315,14 +323,14 @@ def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: event_ty
         return
     height = seen.pose.position[2]
     numbers["object_z"] = height
-    if robot is None or robot.pose.frame != seen.pose.frame:
+    if robot is None or stands is None or stands.frame != seen.pose.frame:
         return
     if robot.torso_height is not None:
-        numbers["height"] = height - robot.pose.position[2] - robot.torso_height
+        numbers["height"] = height - stands.position[2] - robot.torso_height
     x, y, _, _ = seen.pose.orientation
     if 1 - 2 * (x * x + y * y) >= _UPRIGHT_MIN:
         numbers["stand_x"], numbers["stand_y"], _, numbers["stand_yaw"] = _pose_in(
-            robot.pose.position, robot.pose.orientation, seen.pose
+            stands.position, stands.orientation, seen.pose
         )
 
 

@@ -17,7 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -41,6 +41,7 @@ from pycrorm_async.events.types import (
     NodeStatus,
     ObjectReference,
     Observed,
+    PoseValue,
     RobotValue,
 )
 from pycrorm_async.record.declarations import Declared, DeclaredType
@@ -65,6 +66,19 @@ _LAST_ENDS_S = 1.0
 """Bounds the wait of an episode's end for ends of nodes in other threads; each takes microseconds."""
 _DESCRIPTION_MAX = 200
 """Bounds the characters of the description in a notebook."""
+
+
+class ActingRobot(NamedTuple):
+    """The robot that acts at the start of a node.
+
+    Attributes:
+        state: with its pose, for observers.
+        written: the state for the log, encoded once for all nodes until it changes; without the pose if the current row
+            of the robot's object has it.
+    """
+
+    state: RobotValue
+    written: msgspec.Raw | RobotValue
 
 
 class EpisodeWriter:
@@ -125,13 +139,22 @@ class EpisodeWriter:
 
     # --- events -----------------------------------------------------------------------------------------------
 
-    def put(self, event: Happening, owner: str = "", *, may_refuse: bool = False, reserved: bool = True) -> int:
+    def put(
+        self,
+        event: Happening,
+        owner: str = "",
+        *,
+        may_refuse: bool = False,
+        reserved: bool = True,
+        robot: ActingRobot | None = None,
+    ) -> int:
         """Append an event and return its sequence. Parts that cannot be recorded are left out, and counted.
 
         Args:
             owner: the type whose values are counted as missing; by default that of the event.
             may_refuse: raise `Unrecordable` for a missing parameter, if the settings ask for it.
             reserved: use the spool's reserve, and block when that is used up; otherwise raise `SpoolFull`.
+            robot: of the start of a node, to be published with the whole state of the robot.
         """
         emitter, kind = self.emitter, type(event)
         try:
@@ -153,6 +176,8 @@ class EpisodeWriter:
             sequence = emitter.put_payload(heading, payload, at=self.time, after=self._stored)
         self._stored = 0  # the queue has the episode's sequence from now on
         if emitter.feed.observers:
+            if robot is not None and isinstance(event, NodeStarted) and event.robot is not None:
+                event = replace(event, robot=robot.state)
             emitter.feed.publish(self.id, sequence, event)
         return sequence
 
@@ -209,7 +234,7 @@ class EpisodeWriter:
         kind: NodeKind,
         parent: int,
         parameters: dict[str, Any],
-        robot: RobotValue | None,
+        robot: ActingRobot | None,
         missing: Mapping[str, str],
         *,
         may_refuse: bool = False,
@@ -221,8 +246,9 @@ class EpisodeWriter:
         owner = declared.dtype
         if missing:
             self.emitter.note_missing(owner, missing, may_refuse=may_refuse)
-        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, robot, self.simulated)
-        sequence = self.put(event, owner, may_refuse=may_refuse)
+        written = cast("RobotValue", robot.written) if robot is not None else None
+        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, written, self.simulated)
+        sequence = self.put(event, owner, may_refuse=may_refuse, robot=robot)
         self._open[sequence] = owner
         return sequence
 
@@ -584,7 +610,10 @@ def _clean(value: Any) -> Any:
     if isinstance(value, str):
         return clean(value)
     if isinstance(value, msgspec.Struct):
-        defaults = _defaults(value)
+        # A pose is a whole: no part is left out. A robot without its pose would have that of its object's row.
+        defaults = {} if isinstance(value, PoseValue) else _defaults(value)
+        if isinstance(value, RobotValue):
+            del defaults["pose"]
         names = value.__struct_fields__
         return replace(value, **{name: _recordable(getattr(value, name), defaults, name) for name in names})
     if isinstance(value, dict):

@@ -12,10 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
+from sys import intern
 from typing import Any, Generic, TypeVar
 
+from msgspec.structs import replace
+
 from pycrorm_async.events import types as event_types
-from pycrorm_async.record.episode_writer import EpisodeWriter
+from pycrorm_async.events.codec import NotEncodable, encoded
+from pycrorm_async.record.episode_writer import ActingRobot, EpisodeWriter
 from pycrorm_async.record.frames import Frames
 from pycrorm_async.record.geometry import ReadDescription
 from pycrorm_async.record.values import PoseLike, recorded_as
@@ -35,6 +39,8 @@ class ObjectRows(Generic[K]):
         self._episode = episode
         self._emitter = episode.emitter
         self._references: dict[K, event_types.ObjectReference] = {}
+        self._placed: dict[int, tuple[int, event_types.PoseValue]] = {}
+        """The current row of each object and the pose in it, by identity."""
 
     def reference(self, key: K) -> event_types.ObjectReference | None:
         """Return the current row of an object; None if there is none of this key."""
@@ -42,7 +48,10 @@ class ObjectRows(Generic[K]):
 
     def _put_removed(self, key: K, node: int | None) -> int:
         reference = self._references.pop(key, None)
-        return self._put(lambda: event_types.ObjectRemoved(reference, node)) if reference is not None else 0
+        if reference is None:
+            return 0
+        self._placed.pop(reference.object, None)
+        return self._put(lambda: event_types.ObjectRemoved(reference, node))
 
     def _put_joints(self, key: K, positions: Mapping[str, float], node: int | None) -> int:
         reference = self._references.get(key)
@@ -71,13 +80,29 @@ class ObjectRows(Generic[K]):
         if self._emitter.is_closed:
             return 0
         try:
-            self.last = sequence = self._episode.put(build())
+            event = build()
+            self.last = sequence = self._episode.put(event)
         except Exception as error:  # noqa: BLE001  a change of the world must not fail because of a memory
             self._emitter.note_fault("a change of the world", error)
             return 0
-        if row_of is not None:
-            self._references[row_of] = event_types.ObjectReference(sequence if identity is None else identity, sequence)
+        if row_of is not None and isinstance(event, event_types.ObjectAdded | event_types.ObjectMoved):
+            own = sequence if identity is None else identity
+            self._references[row_of] = event_types.ObjectReference(own, sequence)
+            self._placed[own] = sequence, event.pose
         return sequence
+
+    def acting(self, state: event_types.RobotValue) -> ActingRobot:
+        """Return the state of a robot as a node that starts now is written with it."""
+        pose, reference, written = state.pose, state.object, state
+        if pose is not None:
+            row, placed = self._placed.get(reference.object, (0, pose)) if reference is not None else (0, pose)
+            is_in_row = reference is not None and reference.row == row and _are_one_pose(placed, pose)
+            written_pose = None if is_in_row else event_types.BriefPose.of(pose)
+            written = replace(state, pose=written_pose, object_type=intern(state.object_type))
+        try:
+            return ActingRobot(state, encoded(written))
+        except NotEncodable:  # the episode leaves out what cannot be recorded
+            return ActingRobot(state, written)
 
 
 # === recorded objects =========================================================================================
@@ -213,3 +238,7 @@ class RecordedObjects(ObjectRows[Hashable]):
 
 def _are_at_one_place(pose: PoseLike | event_types.PoseValue, other: PoseLike | event_types.PoseValue) -> bool:
     return pose.position == other.position and pose.orientation == other.orientation and pose.frame == other.frame
+
+
+def _are_one_pose(pose: event_types.PoseValue, other: event_types.PoseValue) -> bool:
+    return pose.time_ns == other.time_ns and _are_at_one_place(pose, other)

@@ -40,6 +40,7 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.events.types import (
     Blob,
+    BriefPose,
     CandidateValue,
     CellsValue,
     LocationResolved,
@@ -50,7 +51,6 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectReference,
-    PoseValue,
     RefusalValue,
     RobotValue,
     SeenValue,
@@ -63,6 +63,7 @@ from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.plan.task import TaskTreeNode, current_node
 from pycrorm_async.record.episode_writer import (
     UNAWAITED_MAX,
+    ActingRobot,
     Emitter,
     EpisodeWriter,
     episode_text_of,
@@ -73,7 +74,7 @@ from pycrorm_async.record.objects import ObjectRows
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, current_task
 from pycrorm_async.record.plan_types import Declarations
 from pycrorm_async.record.recording import Recording
-from pycrorm_async.record.values import clean, encode_or_missing, failure_value, pose_value, read_parameters
+from pycrorm_async.record.values import brief_pose, clean, encode_or_missing, failure_value, read_parameters
 from pycrorm_async.world.bullet import BulletWorld, Object, current_world
 from pycrorm_async.world.pose import ObjectType, Pose
 from pycrorm_async.world.world_copy import acting_robot, counterpart, related
@@ -174,7 +175,7 @@ class Episode(EpisodeWriter):
         sequence = self.node_or_root(node)
         return sequence if sequence != self._root else None
 
-    def robot_state(self) -> RobotValue | None:
+    def robot_state(self) -> ActingRobot | None:
         """Return the state of the robot that acts in this context; None if no robot acts, or in a second world."""
         if self.world is None:
             return None
@@ -533,7 +534,7 @@ def location_resolved(search: Search, node: int | None) -> LocationResolved:
         location=clean(search.location),
         offered=tuple(
             CandidateValue(
-                pose_value(each.pose),
+                brief_pose(each.pose),
                 tuple(arm.name for arm in each.arms),
                 each.grasp.name if each.grasp is not None else None,
                 each.torso_height,
@@ -543,7 +544,7 @@ def location_resolved(search: Search, node: int | None) -> LocationResolved:
         taken=search.taken,
         considered=search.considered,
         node=node,
-        refused=tuple(RefusalValue(pose_value(each.pose), clean(each.reason)) for each in search.refused),
+        refused=tuple(RefusalValue(brief_pose(each.pose), clean(each.reason)) for each in search.refused),
         offered_beyond=search.offered_beyond,
         cells=CellsValue(cells.occupied, cells.hidden, cells.free) if cells is not None else None,
     )
@@ -568,7 +569,7 @@ def _seen_value(seen: Seen, references: Episode) -> SeenValue:
     return SeenValue(  # perception often computes numbers of numpy
         clean(thing.name),
         thing.object_type.name,
-        pose_value(seen.pose if seen.pose is not None else thing.pose),
+        brief_pose(seen.pose if seen.pose is not None else thing.pose),
         references.reference(world_object) if world_object is not None else None,
         float(seen.visible) if seen.visible is not None else None,
         float(seen.confidence) if seen.confidence is not None else None,
@@ -600,7 +601,10 @@ class WorldRecorder(ObjectRows[Object]):
         super().__init__(episode)
         self.world = world
         self.sampled: dict[Object, dict[str, float]] = {}
-        self._robots: dict[Object, tuple[Pose, PoseValue, str]] = {}
+        self._poses: dict[Object, tuple[Pose, BriefPose]] = {}
+        """The last recorded pose of each object, as the world has it and as a value."""
+        self._acting: dict[Object, tuple[Pose, float | None, ObjectReference | None, ActingRobot]] = {}
+        """The robots' states at their last nodes, each with pose, torso height and row that it was made of."""
         for each in world.objects:
             self.object_added(each)
         for each in world.objects:
@@ -625,24 +629,29 @@ class WorldRecorder(ObjectRows[Object]):
             row = self._references.get(local_object) if local_object is not None else None
         return row
 
-    def robot(self) -> RobotValue | None:
+    def robot(self) -> ActingRobot | None:
         """Return base pose and torso height of the robot that acts in this context; None if there is no robot."""
         robot = acting_robot(self.world)
         if robot is None:
             return None
-        pose = robot.pose
-        recorded = self._robots.get(robot)
-        if recorded is None or recorded[0] is not pose:
-            self._robots[robot] = recorded = (pose, pose_value(pose), clean(robot.name))
+        pose, row = robot.pose, self._references.get(robot)
         description = robot.robot_description
         torso = description.torso_joint if description is not None else None
-        return RobotValue(
-            recorded[1],
-            robot.object_type._name_,  # `name` takes 0.1 µs longer
-            robot.joint_position(torso) if torso is not None else None,
-            self._references.get(robot),
-            recorded[2],
-        )
+        height = robot.joint_position(torso) if torso is not None else None
+        made_of = self._acting.get(robot)
+        if made_of is not None and made_of[0] is pose and made_of[1] == height and made_of[2] is row:
+            return made_of[3]
+        state = RobotValue(self._value_of(robot, pose), robot.object_type._name_, height, row, clean(robot.name))
+        acting = self.acting(state)
+        self._acting[robot] = pose, height, row, acting
+        return acting
+
+    def _value_of(self, world_object: Object, pose: Pose) -> BriefPose:
+        """Copy the pose of an object, once for the event of its motion and the nodes that start there."""
+        recorded = self._poses.get(world_object)
+        if recorded is None or recorded[0] is not pose:
+            self._poses[world_object] = recorded = pose, brief_pose(pose)
+        return recorded[1]
 
     # --- the world's observer ---------------------------------------------------------------------------------
 
@@ -651,7 +660,7 @@ class WorldRecorder(ObjectRows[Object]):
             lambda: ObjectAdded(
                 clean(added.name),
                 added.object_type.name,
-                pose_value(added.pose),
+                self._value_of(added, added.pose),
                 dict(added.joint_positions()),
                 self._causing_node(),
                 self._emitter.descriptions.declare(added),
@@ -673,7 +682,8 @@ class WorldRecorder(ObjectRows[Object]):
         return red, green, blue, opacity
 
     def object_removed(self, removed: Object) -> None:
-        self._robots.pop(removed, None)
+        self._acting.pop(removed, None)
+        self._poses.pop(removed, None)
         self._put_removed(removed, self._causing_node())
 
     def object_moved(self, moved: Object) -> None:
@@ -685,7 +695,7 @@ class WorldRecorder(ObjectRows[Object]):
                 reference.object,
                 clean(moved.name),
                 moved.object_type.name,
-                pose_value(moved.pose),
+                self._value_of(moved, moved.pose),
                 self._causing_node(),
             ),
             row_of=moved,

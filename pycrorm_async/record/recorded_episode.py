@@ -339,7 +339,8 @@ class RecordedEpisode(EpisodeWriter):
             self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
             self._end_node(self._nodes[key], "LOST")
         node.parent = self._find(parent, "NodeStarted")
-        declared, acting = node.declared, noted(self.emitter, "NodeStarted", self._robot, robot)
+        declared, state = node.declared, noted(self.emitter, "NodeStarted", self._robot, robot)
+        acting = self._objects.acting(state) if state is not None else None
         above = self.node_or_root(node.parent)
         node.sequence = self.put_start(declared, declared.declaration.kind, above, node.parameters, acting, missing)
         node.episode = self

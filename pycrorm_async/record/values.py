@@ -34,6 +34,7 @@ from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.types import (
     Blob,
     BlobReference,
+    BriefPose,
     FailureValue,
     FieldDeclared,
     MissingValue,
@@ -116,6 +117,11 @@ def recorded_as(kind: type) -> str | None:
 def pose_value(pose: PoseLike) -> PoseValue:
     """Copy a pose."""
     return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
+
+
+def brief_pose(pose: PoseLike) -> BriefPose:
+    """Copy a pose for a field of an event whose type is a pose."""
+    return BriefPose.of(pose_value(pose))
 
 
 def encoder_of(field: FieldDeclared) -> Encoder:

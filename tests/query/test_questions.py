@@ -212,6 +212,7 @@ async def test_successful_pick_ups_have_their_object_arm_and_place(reading: Read
     for each in actions():
         if each.dtype == "PickUpAction" and each.status == "SUCCEEDED" and each.started.robot is not None:
             asked, robot = each.started.parameters, each.started.robot
+            assert robot.pose is not None
             place = robot.pose.position[:2]
             way = asked["arm"], asked["grasp"]
             reckoned.append((each.episode, each.sequence, each.object, *way, *place, robot.torso_height, robot.name))
@@ -231,6 +232,7 @@ async def test_the_experience_at_a_place_is_that_of_actions_started_near_it(read
     groups: dict[tuple[str | None, str | None], list[Node]] = {}
     for each in actions():
         if each.started.robot is not None and each.end is not None:
+            assert each.started.robot.pose is not None
             x, y, _ = each.started.robot.pose.position
             if math.hypot(x - 0.4, y) <= 0.45:
                 groups.setdefault((each.dtype, each.started.parameters.get("arm")), []).append(each)

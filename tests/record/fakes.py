@@ -13,7 +13,7 @@ from pycrorm_async.errors import SpoolFull
 from pycrorm_async.events.codec import Heading, decode
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.order import OrderCheck
-from pycrorm_async.events.types import Happening
+from pycrorm_async.events.types import Happening, NodeStarted, ObjectAdded, ObjectMoved, PoseValue
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
@@ -94,6 +94,17 @@ class ListSink:
     def of(self, episode: Episode | EpisodeId) -> list[tuple[int, Happening]]:
         name = episode.id if isinstance(episode, Episode) else episode
         return [(sequence, event) for owner, sequence, event in self.records if owner == name]
+
+    def robot_pose(self, episode: Episode | EpisodeId, started: NodeStarted) -> PoseValue:
+        """Return the pose of the robot at the start of a node: its own, or that of the row that it names."""
+        robot = started.robot
+        assert robot is not None
+        if robot.pose is not None:
+            return robot.pose
+        assert robot.object is not None
+        placed = dict(self.of(episode))[robot.object.row]
+        assert isinstance(placed, ObjectAdded | ObjectMoved)
+        return placed.pose
 
     def only(self) -> list[tuple[int, Happening]]:
         (name,) = self.sequences

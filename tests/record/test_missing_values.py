@@ -345,7 +345,7 @@ async def test_of_two_worlds_in_one_episode_only_the_first_is_recorded(
     events = case.sink.of(episode)
     assert [event.pose.position[0] for _, event in events if isinstance(event, ObjectAdded)] == [1.0]
     robots = {
-        event.parameters["text"]: event.robot and event.robot.pose.position[0]
+        event.parameters["text"]: event.robot and case.sink.robot_pose(episode, event).position[0]
         for _, event in events
         if isinstance(event, NodeStarted) and event.kind == "action"
     }

@@ -97,7 +97,9 @@ async def test_the_robot_state_is_that_at_the_start_of_the_node() -> None:
     starts = [event for _, event in case.sink.of(episode) if isinstance(event, NodeStarted) and event.kind == "action"]
     robots = [start.robot for start in starts]
     assert [robot.torso_height for robot in robots if robot] == [0.0, 0.25, 0.25]
-    assert [robot.pose.position for robot in robots if robot] == [(0, 0, 0), (0, 0, 0), (0.6, 0.4, 0.0)]
+    assert [robot.pose for robot in robots if robot] == [None] * 3  # the row of the robot's object has it
+    poses = [case.sink.robot_pose(episode, start) for start in starts]
+    assert [pose.position for pose in poses] == [(0, 0, 0), (0, 0, 0), (0.6, 0.4, 0.0)]
     assert [robot.object_type for robot in robots if robot] == ["ROBOT"] * 3
 
 
