@@ -46,7 +46,7 @@ def unchanged(old: dict[str, Any]) -> dict[str, Any]:
     return old
 
 
-UPCASTERS: Final[Mapping[tuple[str, int], Upcaster]] = {
+UPCASTERS: Final[dict[tuple[str, int], Upcaster]] = {
     # Version 2 omits frame and orientation of a pose where they are the default, and in NodeStarted the robot's pose
     # where its object's row has it.
     **{(name, 1): unchanged for name in ("ObjectAdded", "ObjectMoved", "LocationResolved", "ObjectDetected")},

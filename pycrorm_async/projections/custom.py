@@ -64,6 +64,7 @@ from pycrorm_async.projections.generations import (
     write_generation,
 )
 from pycrorm_async.projections.mapped_tables import UserView, with_user_views
+from pycrorm_async.projections.named_poses import NamedPoses
 from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, Batch, FoldRunner, Learn, SideTarget
 from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, is_missing, json_text, microseconds, row_of
 from pycrorm_async.store.dialect import Insertion
@@ -454,6 +455,7 @@ class ProjectedBatch(ABC):
         self.reads = None if reads is None else frozenset(each.__name__ for each in reads)
         self._folds = EpisodeFolds(projection) if folds is None else folds
         self._taken: dict[int, _OpenFold] = {}
+        self._named: NamedPoses | None = None
 
     def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
         return [each for each in spans if self._folds.has(each)]
@@ -464,11 +466,20 @@ class ProjectedBatch(ABC):
             fold = self._taken[span.number] = self._folds.take(span.number, span.after)
             while fold.reached < span.after and fold.fault is None:
                 page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
-                fold.fault = self._read_again(fold, await log.spans([page]), page.last)
+                events = await log.spans([page])
+                await self.look_up(log, events)
+                fold.fault = self._read_again(fold, events, page.last)
+
+    async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
+        """Read the poses of robots that are in the rows of objects, for a fold of single events."""
+        if self._named is not None:
+            await self._named.look_up(log, events)
 
     def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
         """Give the next events of an episode to its fold, which is dropped if it cannot fold one; see `Batch.fold`."""
         first = events[0]
+        if self._named is not None:
+            self._named.note(events)
         fold = self._taken.get(first.number)
         if fold is None:
             assert first.sequence == 1, "a batch that continues an episode restores its fold first"
@@ -553,6 +564,8 @@ class CustomRows(ProjectedBatch):
         self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
+        if projection.reads is None or NodeStarted in projection.reads:
+            self._named = NamedPoses()
 
     def add(self, fold: EpisodeFold, events: Iterable[tuple[StoredEvent, Happening]], *, kept: bool) -> Refused | None:
         """Add the changes of rows that a fold makes of events, if both databases store their values alike.
@@ -623,6 +636,8 @@ class CustomRows(ProjectedBatch):
 
     def _event(self, stored: StoredEvent, happening: Happening) -> Event:
         number, sequence, _, _, wall_ns, monotonic_ns, payload = stored
+        if isinstance(happening, NodeStarted) and self._named is not None:
+            happening = self._named.whole(number, happening)
         parameters: Mapping[str, Any] = {}
         dtype = declaration = None
         if isinstance(happening, NodeStarted) and happening.designator is not None:

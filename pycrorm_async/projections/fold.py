@@ -538,6 +538,9 @@ class TableRows:
             async with log.reading() as connection:
                 self._uuids = await uuids_of(connection, starting)
 
+    async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
+        """Read nothing: the id of a row that an event names follows from the event."""
+
     def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
         designators, rows = self._designators, self._rows
         for event, happening in zip(events, happenings, strict=True):

@@ -126,6 +126,10 @@ class Batch(Protocol):
         """
         ...
 
+    async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
+        """Read what these events name in others, before they are folded."""
+        ...
+
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         """Prepare the statements for this generation, after the last event and before the transaction."""
         ...
@@ -341,6 +345,8 @@ class FoldRunner:
         events = await self._log.spans(spans)
         by_number = {number: [*each] for number, each in groupby(events, key=attrgetter("number"))}
         batches, reads = (batch, *batch.beside), batch.reads
+        for each in batches:
+            await each.rows.look_up(self._log, events)
         folded = _SLICE_EVENTS  # since this yielded to the event loop
         for number, after, last in spans:
             part = consecutive(by_number.get(number, ()), after)

@@ -173,6 +173,7 @@ class RecordedValues:
     def __init__(self, convert: Convert | None, objects: RecordedObjects) -> None:
         self._convert = convert
         self._objects = objects
+        self._failures = values.FailureCopies()
 
     def parameters(
         self, declared: DeclaredType, given: Mapping[Any, Any], references: values.References, missing: dict[str, str]
@@ -224,7 +225,7 @@ class RecordedValues:
         """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
         match failure:
             case BaseException():
-                return values.failure_value(failure, references, self.converted)
+                return self._failures.copy(failure, references, self.converted)
             case (str(), str()) | str():
                 reason, message = (UNNAMED, failure) if isinstance(failure, str) else failure
                 return event_types.FailureValue(values.clean(reason), values.clean(message))

@@ -50,12 +50,12 @@ from pycrorm_async.record.geometry import Descriptions
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, end_statuses, episode_started
 from pycrorm_async.record.recorded_before import RecordedBefore
 from pycrorm_async.record.values import (
+    FailureCopies,
     MissingValues,
     ValueReader,
     clean,
     clean_repr,
     cut,
-    failure_value,
     message_of,
     missing_in,
     missing_value,
@@ -89,6 +89,7 @@ class EpisodeWriter:
         id: 16 bytes of a UUID; `str(episode)` is its text.
         closed: whether the last event has been written, or its writing has begun.
         simulated: whether the episode is a simulation.
+        failures: copies the exceptions with which its nodes end.
         refusal: of a named episode: why nothing more is recorded, although it has no end; None without a reason.
     """
 
@@ -97,6 +98,7 @@ class EpisodeWriter:
         self.closed = False
         self.simulated: Final = opening.simulated
         self.emitter = emitter
+        self.failures: Final = FailureCopies()
         self._opening = opening
         self._headings: dict[type[Happening], Heading] = {}
         self._open: dict[int, str] = {}
@@ -290,7 +292,7 @@ class EpisodeWriter:
             return
         self.closed = True
         status, root_status = self._end_statuses(failure)
-        value = failure_value(failure, self) if failure is not None else None
+        value = self.failures.copy(failure, self) if failure is not None else None
         for sequence in sorted(self._open.keys() - {self._root}, reverse=True):
             is_same = status in ("INTERRUPTED", "UNKNOWN")
             self.put_end(sequence, root_status if is_same else "LOST", untimed=status == "UNKNOWN")

@@ -177,7 +177,7 @@ class RecordedObjects(ObjectRows[Hashable]):
             lambda: event_types.ObjectAdded(
                 added.name,
                 added.object_type,
-                added.pose,
+                event_types.BriefPose.of(added.pose),
                 dict(added.joints),
                 node,
                 self._emitter.descriptions.declare(ReadDescription(added.urdf)) if added.urdf is not None else None,
@@ -202,7 +202,9 @@ class RecordedObjects(ObjectRows[Hashable]):
         if _are_at_one_place(pose, last):
             return 0
         sequence = self._put(
-            lambda: event_types.ObjectMoved(reference.object, state.name, state.object_type, pose, node),
+            lambda: event_types.ObjectMoved(
+                reference.object, state.name, state.object_type, event_types.BriefPose.of(pose), node
+            ),
             row_of=key,
             identity=reference.object,
         )

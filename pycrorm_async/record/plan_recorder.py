@@ -74,7 +74,7 @@ from pycrorm_async.record.objects import ObjectRows
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, current_task
 from pycrorm_async.record.plan_types import Declarations
 from pycrorm_async.record.recording import Recording
-from pycrorm_async.record.values import brief_pose, clean, encode_or_missing, failure_value, read_parameters
+from pycrorm_async.record.values import brief_pose, clean, encode_or_missing, read_parameters
 from pycrorm_async.world.bullet import BulletWorld, Object, current_world
 from pycrorm_async.world.pose import ObjectType, Pose
 from pycrorm_async.world.world_copy import acting_robot, counterpart, related
@@ -334,7 +334,7 @@ class Recorder:
         if self._sampler is not None and node.kind == "motion":
             self._guarded("StateSampled", self._sampler.end, episode, sequence)
         try:
-            failure = failure_value(node.failure, episode) if node.failure is not None else None
+            failure = episode.failures.copy(node.failure, episode) if node.failure is not None else None
             result = encode_or_missing(node.result, episode) if node.result is not None else None
             episode.put_end(sequence, node.status._value_, failure, result)  # `value` takes 0.1 µs longer
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan

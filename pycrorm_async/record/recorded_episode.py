@@ -352,7 +352,8 @@ class RecordedEpisode(EpisodeWriter):
             return None
         if isinstance(robot, event_types.RobotValue):
             state = struct_of(robot, event_types.RobotValue)
-            state = replace(state, pose=self._objects.frames.in_map(state.pose))
+            if state.pose is not None:
+                state = replace(state, pose=self._objects.frames.in_map(state.pose))
             return state if self._objects.holds(state.object) else replace(state, object=None)
         if (acting := self._objects.robot(robot)) is None:
             raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
@@ -653,7 +654,7 @@ class RecordedEpisode(EpisodeWriter):
     ) -> Callable[[], object]:
         """Record a result of perception; `object_type` is the type searched for."""
         copied = (noted(self.emitter, "ObjectDetected", struct_of, each, event_types.SeenValue) for each in seen)
-        percepts = [each for each in copied if each is not None]
+        percepts = [replace(each, pose=event_types.BriefPose.of(each.pose)) for each in copied if each is not None]
         event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
 
         def write() -> int:

@@ -19,6 +19,7 @@ import logging
 import math
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from enum import Enum
@@ -26,6 +27,7 @@ from functools import partial
 from reprlib import Repr
 from types import NoneType
 from typing import Any, ClassVar, Final, NamedTuple, Protocol, TypeAlias, cast
+from weakref import ReferenceType, ref
 
 import numpy as np
 
@@ -614,6 +616,35 @@ _FAILURE_NAME_MAX = 500
 """Bounds the characters of an exception's qualified class name."""
 _GROUP_MAX = 100
 """Bounds the recorded exceptions of one exception group."""
+
+
+_ARGS: Final = BaseException.__dict__["args"].__get__
+"""Reads the arguments of an exception, also of a class that replaces `args` by a property."""
+
+
+class FailureCopies:
+    """Copies exceptions for one episode. An exception that several nodes raise on its way up is copied once.
+
+    It is copied again when its arguments or its message are others. The copy does not keep the exception, and with it
+    the frames of its traceback, alive.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[ReferenceType[BaseException], object, str, FailureValue] | None = None
+
+    def copy(
+        self, failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
+    ) -> FailureValue:
+        """Copy as `failure_value` does. Raises no `Exception`."""
+        arguments, message = _ARGS(failure), message_of(failure)
+        if self._last is not None:
+            copied, former_arguments, former_message, value = self._last
+            if copied() is failure and former_arguments is arguments and former_message == message:
+                return value
+        value = failure_value(failure, references, convert)
+        with suppress(TypeError):  # of a built-in class, to which there are no weak references
+            self._last = ref(failure), arguments, message, value
+        return value
 
 
 def failure_value(

@@ -14,7 +14,15 @@ from sqlalchemy import column, func, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.events.types import (
+    EpisodeStarted,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectReference,
+    RobotValue,
+)
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections import custom, pipeline
 from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection, learner_of, states
@@ -31,7 +39,18 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import share_out
 from tests.commands import FORKED, fork
-from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
+from tests.projections.event_script import (
+    PICK_UP,
+    SAYING,
+    Script,
+    declarations,
+    declared,
+    field,
+    mixed,
+    name_of,
+    pose,
+    row,
+)
 from tests.projections.sql_queries import ask, names
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
@@ -107,6 +126,18 @@ async def rebuilt(log: EventLog, projection: Projection) -> None:
         rebuild = await Rebuild.begin(log, projection=projection)
         await rebuild.show()
         assert await clear(log) == []
+
+
+class Stands(Projection):
+    name, version = "stands", 1
+    tables = {"stand": {"x": "real"}}  # noqa: RUF012 - a common form in user code
+    reads = (NodeStarted,)
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        assert isinstance(event.happening, NodeStarted)
+        if event.happening.robot is not None:
+            assert event.happening.robot.pose is not None
+            rows.insert("stand", event.id, x=event.happening.robot.pose.position[0])
 
 
 class NoLeftHand(GraspRate):
@@ -510,3 +541,24 @@ async def test_a_killed_fold_continues_where_it_was(log: EventLog, database_url:
         await folded(log, [], GraspRate())
     assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
     assert (await verify(log, projections=[GraspRate()])).drift == 0
+
+
+@pytest.mark.parametrize("batch_events", [1, 3, 100])
+async def test_a_projection_gets_the_pose_of_the_robot_that_a_node_names_by_a_row(
+    log: EventLog, batch_events: int
+) -> None:
+    script = Script()
+    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
+    robot = script.put(ObjectAdded("pr2", "ROBOT", pose(0.5)))
+    root, row_of_robot, nodes = script.put(NodeStarted("root")), robot, []
+    for x in (0.5, 1.5, 1.5, 2.5):
+        if x != 0.5:
+            row_of_robot = script.put(ObjectMoved(robot, "pr2", "ROBOT", pose(x)))
+        state = RobotValue(None, "ROBOT", 0.25, ObjectReference(robot, row_of_robot), "pr2")
+        nodes.append(script.put(NodeStarted("action", root, name_of(SAYING), {"text": "hi"}, state)))
+    nodes.append(script.put(NodeStarted("action", root, name_of(SAYING), {}, RobotValue(pose(9.5), "ROBOT"))))
+    await folded(log, [*declarations(SAYING), *script.records], Stands(), batch_events=batch_events)
+    rows = [(row(node), x) for node, x in zip(nodes, (0.5, 1.5, 1.5, 2.5, 9.5), strict=True)]
+    assert await ask(log, "SELECT id, x FROM stand ORDER BY id") == rows
+    result = await verify(log, projections=[Stands()])
+    assert (result.drift, result.damage, result.not_compared) == (0, 0, {})

@@ -1,0 +1,204 @@
+"""What an event of an episode has already is named by later ones, and the tables are those of events that repeat it."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from contextlib import suppress
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.events.codec import declaration_of, decode, encode, fingerprint
+from pycrorm_async.events.types import (
+    BriefPose,
+    DesignatorTypeDeclared,
+    Happening,
+    NodeStarted,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.plan import PlanFailure
+from pycrorm_async.plan.actions import (
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    PickUpActionPerformable,
+)
+from pycrorm_async.plan.motions import simulated_robot
+from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.projections.fold import fold_happening, happening_of
+from pycrorm_async.projections.node_row import ROBOT_POSE_ID
+from pycrorm_async.projections.row_batch import Designators, Row, Rows
+from pycrorm_async.record.episode_writer import fitted
+from pycrorm_async.record.values import NO_REFERENCES, FailureCopies, failure_value
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from tests.projections.event_script import Script
+from tests.record.fakes import NoteActionPerformable, RecorderCase, recorder_case
+
+
+async def _plan() -> None:
+    """Move, fail to reach an object, and move again."""
+    Object("pr2", ObjectType.ROBOT)
+    milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
+    designator = ObjectDesignator("milk", ObjectType.MILK, milk)
+    await MoveTorsoActionPerformable(0.25).perform()
+    await NavigateActionPerformable(Pose([0.6, 0.4, 0.0], [0, 0, 0.6, 0.8])).perform()
+    for _ in range(2):
+        with suppress(PlanFailure):
+            await PickUpActionPerformable(designator, Arms.LEFT, Grasp.FRONT).perform()
+        await NavigateActionPerformable(Pose([0.7, 0.9, 0.0])).perform()
+
+
+async def _recorded() -> tuple[RecorderCase, list[Happening]]:
+    with recorder_case() as case, case.episode() as episode, BulletWorld(), simulated_robot:
+        await _plan()
+    return case, [event for _, event in case.sink.of(episode)]
+
+
+def _as_first_version(case: RecorderCase, event: Happening) -> tuple[str, bytes]:
+    """Return an event as it was written before: every pose at each place, with all fields."""
+    if isinstance(event, NodeStarted) and event.robot is not None:
+        (episode,) = case.sink.sequences
+        pose, name = case.sink.robot_pose(episode, event), "".join(("RO", "BOT"))  # not the default itself, so written
+        event = replace(event, robot=replace(event.robot, pose=pose, object_type=name))
+    return type(event).__name__, encode(event)
+
+
+def _folded(case: RecorderCase, script: Script) -> dict[str, dict[Any, Row]]:
+    """Return the rows by table and key."""
+    declared = [encode(each) for _, _, each in case.sink.records if isinstance(each, DesignatorTypeDeclared)]
+    designators = Designators({fingerprint(each): declaration_of(each) for each in declared})
+    rows = Rows()
+    for event in script.stored():
+        fold_happening(event, happening_of(event), designators, rows)
+    keyed: dict[str, dict[Any, Row]] = {}
+    for (table, columns), inserts in rows.to_insert().items():
+        keyed[table] = {(each[: 2 if columns[1] == "joint" else 1]): each for each in inserts}
+    return keyed
+
+
+async def test_the_tables_of_poses_that_are_named_are_those_of_poses_written_at_every_node() -> None:
+    case, events = await _recorded()
+    first, today = Script(), Script()
+    for event in events:
+        first.put_payload(*_as_first_version(case, event), 1)
+        today.put(event)
+    assert all(each.robot.pose is None for each in events if isinstance(each, NodeStarted) and each.robot is not None)
+    before, after = _folded(case, first), _folded(case, today)
+    poses_before, poses_after = before.pop("pose"), after.pop("pose")
+    nodes_before, nodes_after = before.pop("task_tree_node"), after.pop("task_tree_node")
+    assert after == before
+    assert poses_after.items() < poses_before.items()
+    assert nodes_after.keys() == nodes_before.keys()
+    for key, node in nodes_after.items():
+        former = list(nodes_before[key])
+        pose, former_pose = node[ROBOT_POSE_ID], former[ROBOT_POSE_ID]
+        former[ROBOT_POSE_ID] = pose
+        assert node == tuple(former)
+        assert (pose is None) == (former_pose is None)
+        if pose is not None:
+            assert poses_after[pose,][1:] == poses_before[former_pose,][1:]
+
+
+async def test_a_robot_whose_motion_was_not_recorded_is_written_with_its_pose() -> None:
+    with recorder_case() as case, case.episode() as episode, BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT)
+        case.sink.broken = True
+        robot.set_pose(Pose([1, 0, 0]))
+        case.sink.broken = False
+        await NoteActionPerformable("lost").perform()
+        robot.set_pose(Pose([2, 0, 0]))
+        await NoteActionPerformable("kept").perform()
+    starts = [each for _, each in case.sink.of(episode) if isinstance(each, NodeStarted) and each.kind == "action"]
+    lost, kept = (each.robot for each in starts)
+    assert lost is not None
+    assert lost.pose is not None
+    assert lost.pose.position == (1, 0, 0)
+    assert kept is not None
+    assert kept.pose is None
+    assert [case.sink.robot_pose(episode, each).position for each in starts] == [(1, 0, 0), (2, 0, 0)]
+
+
+async def test_an_observer_gets_the_pose_of_the_robot_with_every_node() -> None:
+    with recorder_case() as case, case.episode(), BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT)
+        observed = case.emitter.feed.keep((NodeStarted,), 10, SYSTEM_CLOCK)
+        for x in (0, 1, 1):
+            robot.set_pose(Pose([x, 0, 0]))
+            await NoteActionPerformable().perform()
+    starts = [each.event.happening for each in observed.take()]
+    robots = [each.robot for each in starts if isinstance(each, NodeStarted)]
+    assert [each.pose.position[0] for each in robots if each is not None and each.pose is not None] == [0, 1, 1]
+
+
+def test_a_robot_whose_pose_is_not_finite_is_left_out_and_names_no_row() -> None:
+    robot = RobotValue(PoseValue((math.nan, 0.0, 0.0)), "ROBOT", 0.2, ObjectReference(3, 7))
+    event, reasons = fitted(NodeStarted("action", 2, robot=robot), 2**20)
+    assert isinstance(event, NodeStarted)
+    assert event.robot is None
+    assert reasons == {"robot state": "nan is not a finite number"}
+
+
+@pytest.mark.parametrize(
+    ("pose", "payload"),
+    [
+        (PoseValue((1.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0), "map", 5), b'{"position":[1.0,2.0,0.5],"time_ns":5}'),
+        (PoseValue((1.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0), "lab"), b'{"position":[1.0,2.0,0.5],"frame":"lab"}'),
+        (
+            PoseValue((1.0, 2.0, 0.5), (-0.0, 0.0, 0.0, 1.0)),
+            b'{"position":[1.0,2.0,0.5],"orientation":[-0.0,0.0,0.0,1.0]}',
+        ),
+    ],
+)
+def test_a_brief_pose_omits_what_is_exactly_the_default(pose: PoseValue, payload: bytes) -> None:
+    event = NodeStarted("action", robot=RobotValue(BriefPose.of(pose)))
+    written = encode(event)
+    assert written == b'{"kind":"action","robot":{"pose":%s}}' % payload
+    read = decode("NodeStarted", written)
+    assert isinstance(read, NodeStarted)
+    assert read.robot is not None
+    assert repr(read.robot.pose) == repr(pose)
+
+
+# --- failures -----------------------------------------------------------------------------------------------------
+
+
+class Spilled(Exception):
+    """A failure of a class in Python, to which there are weak references."""
+
+
+def test_an_exception_is_copied_once_until_it_changes_and_is_not_kept_alive() -> None:
+    copies, failure = FailureCopies(), Spilled("milk", 3)
+    first = copies.copy(failure, NO_REFERENCES)
+    assert first == failure_value(failure, NO_REFERENCES)
+    assert copies.copy(failure, NO_REFERENCES) is first
+    other = Spilled("milk", 3)
+    assert copies.copy(other, NO_REFERENCES) is not first
+    failure.args = ("water",)
+    assert copies.copy(failure, NO_REFERENCES).arguments == ["water"]
+    here = weakref.ref(failure)
+    del failure
+    assert here() is None
+
+
+def test_an_exception_of_a_built_in_class_is_copied_at_each_node() -> None:
+    copies, failure = FailureCopies(), ValueError("too far")
+    assert copies.copy(failure, NO_REFERENCES) == copies.copy(failure, NO_REFERENCES)
+    assert copies.copy(failure, NO_REFERENCES).message == "too far"
+
+
+class Changing(Exception):
+    text = "first"
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def test_an_exception_whose_message_changes_on_its_way_up_is_copied_again() -> None:
+    copies, failure = FailureCopies(), Changing()
+    assert copies.copy(failure, NO_REFERENCES).message == "first"
+    failure.text = "second"
+    assert copies.copy(failure, NO_REFERENCES).message == "second"
