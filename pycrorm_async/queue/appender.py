@@ -178,19 +178,7 @@ class Appender(core.Tail):
         at: tuple[int, int] | None = None,
         after: int = 0,
     ) -> int:
-        """Append one event as `RecorderQueue.put_nowait` does."""
-        sequence = self.append(heading, payload, reserved) if at is None else None
-        return self._put(heading, payload, reserved, at, after) if sequence is None else sequence
-
-    def _put(
-        self,
-        heading: Heading,
-        payload: bytes,
-        reserved: bool,  # noqa: FBT001
-        at: tuple[int, int] | None,
-        after: int,
-    ) -> int:
-        """Append one event of any kind, or raise: the whole of `put`, which `append` does in part."""
+        """Append one event of any kind as `RecorderQueue.put_nowait` does, which tries `append` first."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
         body = encode_body(name, payload)

@@ -114,6 +114,7 @@ class RecorderQueue:
                 hurry=self._sync_thread.hurry,
                 make_room=self._stored_segments.make_room,
             )
+            self._append: Final = self._appender.append
             if self._appender.prepare():
                 self._sync_thread.call_in(PROGRESS_INTERVAL_S)
             self._progress = Progress.make(folder) if offered else None
@@ -173,7 +174,8 @@ class RecorderQueue:
             InternalError: an event before its `EpisodeStarted` or after its `EpisodeEnded`, or a record above
                 `record_bytes_max` that no segment can hold. The hooks put neither.
         """
-        return self._appender.put(heading, payload, reserved, at, after)
+        sequence = self._append(heading, payload, reserved) if at is None else None
+        return self._appender.put(heading, payload, reserved, at, after) if sequence is None else sequence
 
     def put_blob(self, content: bytes) -> str:
         """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.

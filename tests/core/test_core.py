@@ -39,7 +39,7 @@ from pycrorm_async.queue.format import (
     salt_of,
 )
 from pycrorm_async.queue.scan import SegmentScanner
-from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, ended, episode, node, started
+from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, append, ended, episode, node, started
 
 ROOT = Path(__file__).parent.parent.parent
 compiled = pytest.mark.skipif(not core.IS_COMPILED, reason=f"the core is not compiled: {core.PURE_REASON}")
@@ -104,7 +104,7 @@ def written_by(spool: Path, steps: list[Step], clock: Clock) -> tuple[list[bytes
             author.sync()
             continue
         try:
-            outcomes.append(author.appender.put(heading, b"%d" % size * size if size else b"", reserved))
+            outcomes.append(append(author.appender, heading, b"%d" % size * size if size else b"", reserved))
         except PycrormError as error:
             outcomes.append(repr(error).replace(str(spool), ""))
     last = [sequence for sequence, _, _ in author.appender.open.values()]
@@ -140,13 +140,13 @@ def test_both_cores_write_the_same_segments_and_refuse_the_same(tmp_path_factory
 @compiled
 def test_the_compiled_core_appends_all_that_needs_no_decision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decided: list[str] = []
-    put = Appender._put
+    put = Appender.put
 
     def watched(appender: Appender, heading: Heading, *others: Any) -> int:
         decided.append(heading.type)
         return put(appender, heading, *others)
 
-    monkeypatch.setattr(Appender, "_put", watched)
+    monkeypatch.setattr(Appender, "put", watched)
     author = FolderWriter(tmp_path)
     for heading in (started(), node(), DECLARED, node(), node(), ended()):
         author.put(heading)
@@ -185,7 +185,7 @@ def test_a_record_whose_wake_was_interrupted_is_written_and_the_next_one_wakes(t
     author.appender._wake = interrupted
     for position in (2, 3):
         with pytest.raises(KeyboardInterrupt):
-            author.appender.put(node(), b"{}", True)
+            append(author.appender, node(), b"{}", True)
         assert author.appender.position == position
     assert len(woken) == 2
     author.appender.close()
@@ -194,7 +194,7 @@ def test_a_record_whose_wake_was_interrupted_is_written_and_the_next_one_wakes(t
 def test_no_record_is_put_while_another_thread_changes_the_state(tmp_path: Path) -> None:
     author = FolderWriter(tmp_path)
     author.put(started())
-    thread = threading.Thread(target=lambda: author.appender.put(node(), b"{}", True))
+    thread = threading.Thread(target=lambda: append(author.appender, node(), b"{}", True))
 
     def change() -> int:
         thread.start()
@@ -215,7 +215,7 @@ def test_the_mapping_is_released_before_it_is_closed(tmp_path: Path) -> None:
     assert buffer.closed
     assert author.appender._buffer is None
     with pytest.raises((TypeError, ValueError)):
-        author.appender.put(node(), b"{}", True)
+        append(author.appender, node(), b"{}", True)
 
 
 @compiled
@@ -224,7 +224,7 @@ def test_arguments_of_other_types_are_left_to_python(tmp_path: Path) -> None:
     author = FolderWriter(tmp_path)
     author.put(started())
     mine = started().episode
-    append: Callable[..., int | None] = author.appender.append
+    take: Callable[..., int | None] = author.appender.append
     for heading, payload in (
         (Heading(mine, "\ud800", 1), b"{}"),
         (Heading(mine, "", 1), b"{}"),
@@ -237,11 +237,11 @@ def test_arguments_of_other_types_are_left_to_python(tmp_path: Path) -> None:
         (Heading(mine, "x", 1), bytearray(b"{}")),
         ((b"short", "x", 1), b"{}"),
     ):
-        assert append(heading, payload, True) is None
+        assert take(heading, payload, True) is None
     assert author.appender.position == 1
     with pytest.raises(TypeError):
-        append()
-    assert append(Heading(mine, "x", 2**16 - 1), b"{}", True) == 2
+        take()
+    assert take(Heading(mine, "x", 2**16 - 1), b"{}", True) == 2
     author.appender.close()
 
 

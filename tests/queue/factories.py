@@ -112,6 +112,12 @@ async def recover(folder: Path) -> list[Record]:
         recovered.release()
 
 
+def append(appender: Appender, heading: Heading, payload: bytes, reserved: bool) -> int:
+    """Put as a queue does: with the compiled core if it takes the record."""
+    sequence = appender.append(heading, payload, reserved)
+    return appender.put(heading, payload, reserved) if sequence is None else sequence
+
+
 class FolderWriter:
     """Write a recorder's folder step by step without a sync thread: the test calls each step of a sync.
 
@@ -141,7 +147,7 @@ class FolderWriter:
     def put(self, heading: Heading, payload: bytes = b"{}") -> None:
         if heading.episode is None:
             self._declared[payload] = heading
-        sequence = self.appender.put(heading, payload, True)
+        sequence = append(self.appender, heading, payload, True)
         repeated = self.appender.position - len(self.records) - 1
         put = [(each, 0, content) for content, each in list(self._declared.items())[:repeated]]
         put.append((heading, sequence, payload))
