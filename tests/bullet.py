@@ -7,22 +7,44 @@ from importlib import import_module
 from importlib.metadata import distributions
 from typing import Any, Final
 
-from pycrorm_async.world import bullet_body
-from pycrorm_async.world.bullet_body import engine
+import pytest
+
+from pycrorm_async.world import BulletWorld, Object
+from pycrorm_async.world.engines import bullet as bullet_engine
+from pycrorm_async.world.engines import engine_class
+from pycrorm_async.world.engines.bullet import Bullet, library
 
 _FREE_MAX: Final = 8
 """Bounds the clients that wait for the next world."""
 
-INSTALLED_BULLETS = tuple(
-    name for name in ("pybullet", "pycram-bullet", "pybullet-arm64") if any(distributions(name=name))
+INSTALLED_ENGINES = tuple(
+    name for name in ("pybullet", "pycram-bullet", "pybullet-arm64", "mujoco-core") if any(distributions(name=name))
 )
-"""The installed packages that contain Bullet."""
+"""The installed packages that contain an engine."""
+ENGINE: Final = engine_class().title() if INSTALLED_ENGINES else ""
+"""Name and version of the engine of worlds in the tests; of another one with PYCRORM_ENGINE."""
 
 
 def __getattr__(name: str) -> Any:
     if name.startswith("__"):  # asked for by the import system
         raise AttributeError(name)
-    return getattr(engine(), name)
+    return getattr(library(), name)
+
+
+def link_number(obj: Object, link: str) -> int:
+    """Return Bullet's number of a link."""
+    return _engine(obj.world).link_number(obj.body.number, link)
+
+
+def client_of(world: BulletWorld) -> int:
+    """Return Bullet's number of a world; skip the test in a world of another engine."""
+    return _engine(world).client
+
+
+def _engine(world: BulletWorld) -> Bullet:
+    if not isinstance(world.engine, Bullet):
+        pytest.skip("Bullet itself is asked")
+    return world.engine
 
 
 def reuse_clients() -> None:
@@ -49,4 +71,4 @@ def reuse_clients() -> None:
         module.connect, module.disconnect = reused, kept
         return module
 
-    vars(bullet_body)["import_module"] = loaded
+    vars(bullet_engine)["import_module"] = loaded

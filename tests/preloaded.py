@@ -21,8 +21,8 @@ from pycrorm_async.record.opening import Provenance
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.world.bullet_body import engine
-from pycrorm_async.world.pose import BulletMissing
+from pycrorm_async.world.engines import bullet
+from pycrorm_async.world.pose import EngineMissing
 
 configure_mappers()
 FIRST = next_number(())
@@ -38,7 +38,7 @@ for url in ("sqlite:///memory.db", "postgresql://nobody@/memory"):
         table_texts(CORE | OF_NO_EPISODE | tables, generation, stored, connectionless.dialect)
 CliRunner().invoke(app("status"), ["status", "--url", "nothing"])
 Provenance.of(None, Settings(), SYSTEM_CLOCK)
-with suppress(BulletMissing):
-    engine()
+with suppress(EngineMissing):
+    bullet.library()
 gc.freeze()
 gc.enable()

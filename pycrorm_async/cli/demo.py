@@ -30,7 +30,7 @@ from pycrorm_async.plan import PlaceAction as PutDown
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
-from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.engines import engine_class
 
 
 def kitchen_world() -> None:
@@ -65,7 +65,7 @@ async def breakfast() -> None:
 
 def demo(place: Place, as_json: JsonOption = False) -> None:
     """Run and record the thesis' example plan, then query it."""
-    engine()  # raises `BulletMissing` before a database is created
+    engine_class()  # raises `EngineMissing` before a database is created
     answers = asyncio.run(_run_and_query(*place))
     if as_json:
         print_json(answers.document())

@@ -37,7 +37,7 @@ from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Scene, Tally
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.engines import engine_class
 from pycrorm_async.world.urdf import Limits
 
 _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
@@ -139,7 +139,7 @@ def _check_packages() -> None:
             importlib.import_module(module)
         except ImportError:
             raise MissingExtra(f"{package} is not installed: pip install 'pycrorm-async[learning]'") from None
-    engine()  # raises `BulletMissing`
+    engine_class()  # raises `EngineMissing`
 
 
 def _check_files(policy: Path, figure: Path) -> None:

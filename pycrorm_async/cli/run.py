@@ -35,6 +35,7 @@ from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.record.opening import PlanSource
 from pycrorm_async.record.values import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
+from pycrorm_async.world.engines import ENGINES, VARIABLE, engine_class
 
 _DRAIN_WAIT_S = 2
 """Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""
@@ -90,6 +91,16 @@ def run(
     show_traceback: Annotated[
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
     ] = False,
+    engine: Annotated[
+        str | None,
+        typer.Option(
+            envvar=VARIABLE,
+            metavar="|".join(ENGINES),
+            autocompletion=lambda: [*ENGINES],
+            help="Engine of worlds for which the plan names none; default: the first of these that is installed.",
+            show_envvar=True,
+        ),
+    ] = None,
     form: Form,
 ) -> int:
     """Run a plan and record it.
@@ -106,6 +117,9 @@ def run(
         record_meshes=_choice("--record-meshes", record_meshes, get_args(RecordMeshes)),
     )
     tags = checked_tags(tag or ())
+    if engine is not None:
+        engine_class(engine)
+        os.environ[VARIABLE] = engine  # of this process, for the worlds of the plan and of the processes it starts
     loaded = load_plan(plan)
     if tags and loaded.takes_memory:
         raise CallerError(

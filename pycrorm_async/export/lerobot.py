@@ -335,7 +335,7 @@ async def draw_frames(
 
     `report_events` gets the event up to which the frames are drawn.
 
-    Raises `BulletMissing` without the extra `world`.
+    Raises `EngineMissing` without the extra `world`.
     """
     camera = _camera(frames, size)
     sequences = sorted({each.sequence for each in frames.at})

@@ -26,6 +26,7 @@ It needs no file but the database: each object is made from its recorded descrip
 from __future__ import annotations
 
 import inspect
+import logging
 import typing
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
@@ -56,6 +57,7 @@ from pycrorm_async.world.models import built_in_that_fits, point_urdf
 from pycrorm_async.world.pose import DuplicateName, ObjectType, Pose, Vector, WorldMode
 from pycrorm_async.world.urdf import robot_description
 
+_log = logging.getLogger("pycrorm_async")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _WITHOUT_POSE = "object {!r} was recorded as one outside the world, and without a pose"
 
@@ -310,6 +312,17 @@ class RecordedWorld(BulletWorld):
     assumed: Mapping[str, str] = MappingProxyType({})
     _mesh_folder: TemporaryDirectory[str] | None = None
 
+    def note_engine(self, recorded: str | None) -> None:
+        """Log that the episode was recorded in a world of another engine, if that is known."""
+        title = self.engine_title or ""
+        if recorded is not None and recorded.split()[0] != title.split()[0]:
+            _log.warning(
+                "the episode was recorded in a world of %s, and this one is of %s: distances between shapes may"
+                " differ by 2 mm",
+                recorded,
+                title,
+            )
+
     def write_meshes(self, contents: Mapping[str, bytes]) -> Path:
         """Write mesh files, by name, into a folder that exists until the world is left, for copies of the world."""
         self._mesh_folder = TemporaryDirectory(prefix="pycrorm-meshes-")
@@ -347,12 +360,14 @@ def world_of(
     *,
     descriptions: Mapping[str, str | Path] = MappingProxyType({}),
     mode: WorldMode = WorldMode.DIRECT,
+    engine: str | None = None,
 ) -> RecordedWorld:
     """Return a world that has, once it is entered, the objects of the snapshot in their state of that moment.
 
     An object is made from its recorded description and has its colour. The box around its link takes the place of a
     mesh, unless the snapshot has the mesh file (`record_meshes="files"` and `as_of(..., meshes=True)`). An entry in
-    `descriptions`, by name, replaces the recorded one: URDF text, or the path of a .urdf file.
+    `descriptions`, by name, replaces the recorded one: URDF text, or the path of a .urdf file. A world in another
+    engine than the recorded one is logged; `mode` and `engine` are those of `BulletWorld`.
 
     Version 0.1.0 recorded no descriptions. An object of such an episode gets the built-in shape for its name and type,
     if that has all recorded joints and the links that objects are attached to; otherwise it is a labelled point with
@@ -378,6 +393,7 @@ def world_of(
     files = {name: then.meshes[Path(name).stem] for shape in shapes.values() for name in shape.meshes.values()}
 
     def add_objects(_world: BulletWorld) -> None:
+        world.note_engine(then.engine)
         folder = world.write_meshes(files) if files else None
         for each in then.objects:
             urdf, _assumed, is_point, meshes = shapes[each.name]
@@ -400,7 +416,7 @@ def world_of(
                 added.label(each.name)
         world.restore_state(then.state)
 
-    world = RecordedWorld(mode, set_up=add_objects)
+    world = RecordedWorld(mode, engine=engine, set_up=add_objects)
     world.assumed = {name: shape.assumed for name, shape in shapes.items() if shape.assumed is not None}
     return world
 

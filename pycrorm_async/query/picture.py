@@ -1,4 +1,4 @@
-"""Draw the scene of an episode at a moment as PNG: a world made from the recorded geometry, photographed by Bullet.
+"""Draw the scene of an episode at a moment as PNG: a world made from the recorded geometry, photographed there.
 
 The world is made in a thread with an empty context, so that it belongs to no open episode and is not recorded.
 """
@@ -69,7 +69,7 @@ async def picture(
         focus: name of the object to frame instead.
 
     Raises `UnknownEpisode`; `CallerError` for a moment without objects or without recorded shapes, an unknown `focus`,
-    an angle that is none, or a size that is too small or too large; `BulletMissing`.
+    an angle that is none, or a size that is too small or too large; `EngineMissing`.
     """
     if min(width, height) < _PIXELS_LEAST or width * height > _PIXELS_MAX:
         raise CallerError(

@@ -14,7 +14,7 @@ Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from types import MappingProxyType
@@ -23,15 +23,17 @@ from typing import Any, NamedTuple, TypeAlias
 from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.ids import SLOT_NODE, row_id
-from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.events.types import DescriptionDeclared, EpisodeEnded
+from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.replay import LATEST_MAX, EpisodeReplay, ReplayedNode, WorldObject
 from pycrorm_async.query.text import NotebookValue
 from pycrorm_async.store.log import EventLog, episode_named
-from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.visible_text import visible
-from pycrorm_async.world.bullet_body import ObjectState, WorldState
+from pycrorm_async.world.body import ObjectState, WorldState
+from pycrorm_async.world.engines import engine_in
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
 
@@ -111,6 +113,7 @@ class WorldThen(NotebookValue):
         descriptions: the descriptions of the objects, by fingerprint.
         meshes: contents of their recorded mesh files, by SHA-256; empty unless the snapshot was requested with them.
         robots: all of type ROBOT, in the order they were added.
+        engine: name and version of the world's engine; None if it is not known, as in an episode that did not end.
     """
 
     objects: tuple[ObjectThen, ...]
@@ -118,6 +121,7 @@ class WorldThen(NotebookValue):
     descriptions: Mapping[str, DescriptionDeclared] = field(default_factory=dict)
     meshes: Mapping[str, bytes] = field(default_factory=dict, repr=False)
     robots: tuple[RobotThen, ...] = ()
+    engine: str | None = None
 
     def object(self, name: str) -> ObjectThen:
         """Return the object with this name. Raises `CallerError` if the world had none."""
@@ -215,6 +219,8 @@ class Moment(NotebookValue):
 # are not folded yet, and for parked episodes. It reads no further than one page beyond the moment.
 
 _NUMBERS_END = 1e15
+_END_WITHIN = 100
+"""Bounds the last events that are searched for the end of an episode, behind which only tags may follow."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 _Within: TypeAlias = Callable[[int, StoredEvent], bool]
@@ -241,7 +247,17 @@ async def as_of(
     if replay.at.sequence == 0:
         raise CallerError(f"{limit} is before episode {row.number} began")
     replay.dtypes = await log.dtypes()
-    return await _moment_of(replay, log, meshes=meshes)
+    moment = await _moment_of(replay, log, meshes=meshes)
+    line = replay.started.world or await _entered_world(log, row)
+    return replace(moment, world=replace(moment.world, engine=engine_in(line or "")))
+
+
+async def _entered_world(log: EventLog, row: EpisodeRow) -> str | None:
+    """Return the line that the end of an episode has of its world; None before the end, and without a world."""
+    for event in await log.events(row.number, after=max(0, row.head - _END_WITHIN)):
+        if event.type == "EpisodeEnded" and isinstance(ended := happening_of(event), EpisodeEnded):
+            return ended.world
+    return None
 
 
 async def moments(log: EventLog, number: int, sequences: Collection[int]) -> AsyncIterator[Moment]:

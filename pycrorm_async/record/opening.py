@@ -85,7 +85,7 @@ def _refuse_blob(_content: bytes, _media_type: str) -> Any:
 # on its own.
 
 _LIBRARIES = (
-    *"pycrorm-async pycram-robotics pybullet pycram-bullet pybullet-arm64 optik-py pyjpt".split(),
+    *"pycrorm-async pycram-robotics pybullet pycram-bullet pybullet-arm64 mujoco-core optik-py pyjpt".split(),
     *"numpy msgspec SQLAlchemy aiosqlite asyncpg".split(),
 )
 """The packages whose versions are recorded: those that act in the world, learn, encode events and store them."""

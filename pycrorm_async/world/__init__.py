@@ -1,7 +1,7 @@
-"""A kinematic Bullet world, its objects, and descriptions of robots. This package does not depend on the memory.
+"""A kinematic world in Bullet or MuJoCo, its objects, and descriptions of robots. It does not depend on the memory.
 
-Importing it imports neither Bullet nor numpy: the classes are loaded on first access, Bullet when the first world is
-entered.
+Importing it imports neither an engine nor numpy: the classes are loaded on first access, the engine when the first
+world is entered.
 
 >>> with BulletWorld() as world:
 ...     robot = Object("pr2", ObjectType.ROBOT)
@@ -15,9 +15,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pycrorm_async.world.body import WorldState
     from pycrorm_async.world.bounding_boxes import BoundingBox
     from pycrorm_async.world.bullet import BulletWorld, Object, WorldObserver, WorldWatcher, current_world, watcher
-    from pycrorm_async.world.bullet_body import WorldState
     from pycrorm_async.world.pose import (
         Arms,
         Grasp,
@@ -92,7 +92,7 @@ __all__ = [
     "watcher",
 ]
 
-_MODULES = ("pose", "urdf", "bounding_boxes", "bullet_body", "bullet", "world_copy", "queries")
+_MODULES = ("pose", "urdf", "bounding_boxes", "engines", "body", "bullet", "world_copy", "queries")
 """The modules that define these names; each imports some of those before it, and none after it."""
 
 

@@ -1,4 +1,4 @@
-"""A world owns one Bullet client and its objects, and notifies its observers of every change.
+"""A world owns one physics engine and its objects, and notifies its observers of every change.
 
 Motions are kinematic: setters place objects and joints, the simulation is never stepped, and objects do not fall. Any
 number of worlds can be open at once, in tasks and threads; one world belongs to one thread at a time.
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,17 +24,9 @@ from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 
 from pycrorm_async.connected_var import ConnectedVar
-from pycrorm_async.world import bullet_body
+from pycrorm_async.world.body import Body, ObjectState, WorldState, check_state, inner_points, set_state
 from pycrorm_async.world.bounding_boxes import BoundingBox
-from pycrorm_async.world.bullet_body import (
-    Body,
-    Color,
-    ObjectState,
-    WorldState,
-    check_state,
-    engine,
-    set_state,
-)
+from pycrorm_async.world.engines import Color, Engine, engine_class
 from pycrorm_async.world.model_boxes import shape_boxes
 from pycrorm_async.world.models import built_in_urdf
 from pycrorm_async.world.pose import (
@@ -56,7 +47,6 @@ from pycrorm_async.world.pose import (
     UnknownLink,
     WorldClosed,
     WorldMode,
-    WorldUnavailable,
 )
 from pycrorm_async.world.urdf import RobotDescription, robot_description
 from pycrorm_async.world.urdf_model import Model, read_model, urdf_text
@@ -66,7 +56,6 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger("pycrorm_async")
-_GRAVITY_M_PER_S2 = -9.8
 
 
 class BulletWorld:
@@ -81,7 +70,9 @@ class BulletWorld:
     block every change raises `WorldClosed`; the last poses and joint positions can still be read.
 
     Args:
-        mode: whether Bullet opens a window.
+        mode: whether the engine opens a window.
+        engine: its name, "bullet" or "mujoco", or a class with its methods; None means that of PYCRORM_ENGINE, else the
+            first of these two that is installed.
         copy_of: the world this one is a copy of; only for `world_copy.copied`. A copy has no watcher.
         set_up: adds the first objects when the world has been entered; if it raises, the world is left again.
     """
@@ -90,6 +81,7 @@ class BulletWorld:
         self,
         mode: WorldMode = WorldMode.DIRECT,
         *,
+        engine: str | type[Engine] | None = None,
         copy_of: BulletWorld | None = None,
         set_up: Callable[[BulletWorld], None] | None = None,
     ) -> None:
@@ -100,7 +92,10 @@ class BulletWorld:
         self._objects: dict[int, Object] = {}
         self._robot: Object | None = None
         self._observers: tuple[WorldObserver, ...] = ()
-        self._client: int | None = None
+        self._engine_asked = engine
+        self._engine: Engine | None = None
+        self.engine_title: str | None = None
+        """Name and version of the engine; None before the world is entered."""
         self._left = False
         self._outer: BulletWorld | None = None
         self._watcher: WorldWatcher | None = None
@@ -133,9 +128,10 @@ class BulletWorld:
             self.__exit__(None, None, None)
 
     def _begin(self) -> None:
-        if self._client is not None or self._left:
+        if self._engine is not None or self._left:
             raise WorldClosed("a world can be entered only once; create a new BulletWorld()")
-        self._client = _connect(self.mode)
+        chosen = engine_class(self._engine_asked)
+        self._engine, self.engine_title = chosen(self.mode), chosen.title()
 
     def _notify_entered(self) -> None:
         self._watcher = watcher.get() if self.copy_of is None else None
@@ -168,30 +164,37 @@ class BulletWorld:
         current_world.disconnect(self)
         if current_world.here() is self:  # False if the context manager is closed in another context
             current_world.set(self._outer)
-        client, self._client, self._left = self.client, None, True
-        engine().disconnect(physicsClientId=client)
+        engine, self._engine, self._left = self.engine, None, True
+        engine.close()
 
     @property
     def entered(self) -> bool:
         """True while the world is entered and not left."""
-        return self._client is not None
+        return self._engine is not None
 
     @property
-    def client(self) -> int:
-        """Bullet's number of this world. Raises `WorldClosed`."""
-        if self._client is None:
+    def engine(self) -> Engine:
+        """The engine, for this package only: moving its bodies notifies no observer. Raises `WorldClosed`."""
+        if self._engine is None:
             raise WorldClosed(
                 "the world is closed; only its last poses and joint positions can be read"
                 if self._left
                 else "the world is not entered; act inside `with BulletWorld() as world:`"
             )
-        return self._client
+        return self._engine
+
+    @property
+    def client(self) -> int:
+        """Bullet's number of this world. Raises `WorldClosed`, and `AttributeError` in a world of another engine."""
+        client: int = getattr(self.engine, "client")  # noqa: B009  only Bullet's engine has one
+        return client
 
     @property
     def description(self) -> str:
-        """The world's mode and objects in one line."""
+        """The world's mode, engine and objects in one line."""
         objects = ", ".join(f"{obj.name} ({obj.object_type.name})" for obj in self.objects)
-        return f"BulletWorld ({self.mode.value}): {objects or 'empty'}"
+        mode = ", ".join(filter(None, (self.mode.value, self.engine_title)))
+        return f"BulletWorld ({mode}): {objects or 'empty'}"
 
     # --- objects ----------------------------------------------------------------------------------------------
 
@@ -243,7 +246,7 @@ class BulletWorld:
 
         Objects that are in that state already are not moved, and observers get no call for them.
         """
-        _ = self.client
+        _ = self.engine
         for each in self.attachments:
             each.parent.detach(each.child)
         for obj in self.objects:
@@ -266,7 +269,7 @@ class BulletWorld:
         name now belongs to an object without that joint, `PoseRefused` or `JointLimitExceeded` if a hand-made state
         has numbers that are not finite.
         """
-        _ = self.client
+        _ = self.engine
         states = {self.object(name): state for name, state in saved.objects.items()}
         for obj, state in states.items():
             check_state(obj.name, obj.body, state)
@@ -301,8 +304,10 @@ class BulletWorld:
 
         Objects in `ignore` are transparent. A ray does not hit the shape it starts in. Points are in "map", m.
         """
-        transparent = [obj.body for obj in ignore if self.has(obj)]
-        numbers = bullet_body.first_met(self.client, starts, ends, transparent=transparent)
+        if len(starts) != len(ends):
+            raise ValueError(f"every ray needs a start and an end, got {len(starts)} starts and {len(ends)} ends")
+        transparent = [obj.body.number for obj in ignore if self.has(obj)]
+        numbers = self.engine.first_met(starts, ends, transparent) if len(starts) else []
         return [self._objects.get(number) for number in numbers]
 
     def met_towards(self, obj: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> list[Object | None]:
@@ -311,7 +316,7 @@ class BulletWorld:
         None means the floor. The list is empty for an object without shapes.
         """
         obj.check_present()
-        points = bullet_body.inner_points(obj.body)
+        points = inner_points(obj.body)
         others = [each for each in ignore if each is not obj]
         return self.ray_test([eye] * len(points), points, ignore=others) if points else []
 
@@ -350,25 +355,6 @@ class BulletWorld:
         """Notify the observers, after a motion is complete, that these joints have new positions."""
         for observer in self._observers:
             observer.joints_moved(obj, positions)
-
-
-def _connect(mode: WorldMode) -> int:
-    """Open a Bullet client with a floor."""
-    bullet = engine()
-    if mode is WorldMode.GUI and not os.environ.get("DISPLAY"):  # without a display Bullet ends the process
-        raise WorldUnavailable("a window needs a display, but DISPLAY is not set; use WorldMode.DIRECT")
-    try:
-        client: int = bullet.connect(bullet.GUI if mode is WorldMode.GUI else bullet.DIRECT)
-    except bullet.error as reason:
-        raise WorldUnavailable(f"Bullet cannot open another world: {reason}") from reason
-    if client < 0:
-        raise WorldUnavailable("Bullet cannot open another world; close worlds that are not needed")
-    # Bullet's file cache is keyed by name: it would return the old text of a changed description, and never shrink.
-    bullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
-    bullet.setGravity(0, 0, _GRAVITY_M_PER_S2, physicsClientId=client)
-    floor = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client)
-    bullet.createMultiBody(0, floor, physicsClientId=client)
-    return client
 
 
 # === attachments ==============================================================================================
@@ -483,7 +469,7 @@ class Object:
         packages: folders of ROS packages by their names, for `package://` in the URDF; those of the robot's description
             count too. See `urdf_model.urdf_text`.
 
-    Elements of the URDF without effect, and what Bullet remarks about it, are logged once, not for copies of an object.
+    Elements of the URDF without effect, and remarks of the engine, are logged once, not for copies of an object.
 
     Raises:
         ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused, UnknownLink.
@@ -501,7 +487,7 @@ class Object:
     chains: dict[Arms, Chain]
     """The chains of a robot's arms that were needed so far, for `kinematics`."""
     body: Body
-    """The body in Bullet, for this package only: moving it notifies no observer."""
+    """The body in the engine, for this package only: moving it notifies no observer."""
     copy_of: Object | None
     """The object of the original world of which this one is a copy; None outside copied worlds."""
     __recorded_as__: ClassVar[str] = "Object"
@@ -525,7 +511,7 @@ class Object:
         world = world if world is not None else current_world.get()
         if world is None:
             raise NoWorld(f"object {name!r}")
-        client = world.client
+        engine = world.engine
         if any(present.name == name for present in world.objects):
             raise DuplicateName(name)
         self.name = name
@@ -553,7 +539,7 @@ class Object:
         self.color = color
         self._mass_kg = mass_kg
         self.chains = {}
-        self.body = Body(name, self.model, client, pose, color, base_link or "")
+        self.body = Body(name, self.model, engine, pose, color, base_link or "")
         if world.copy_of is None:
             self._log_left_out()
         self.original_pose = self.body.pose
@@ -817,7 +803,7 @@ class Object:
 
     def check_present(self) -> None:
         """Raise `WorldClosed` if the world is closed, `ObjectNotInWorld` if the object was removed."""
-        _ = self.world.client
+        _ = self.world.engine
         if not self.world.has(self):
             raise ObjectNotInWorld(self.name, tuple(present.name for present in self.world.objects))
 

@@ -82,14 +82,22 @@ def mesh_points(path: str) -> NDArray[np.float64]:
     Raises `ValueError` as `read_mesh` does.
     """
     try:
-        status = os.stat(path)  # noqa: PTH116  a fifth of the time of Path.stat
-        return _points(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+        return _points(path, file_status(path))
     except (OSError, ValueError) as error:
         raise ValueError(f"mesh {path}: {error}") from error
 
 
+FileStatus = tuple[int, int, int, int]
+
+
+def file_status(path: str) -> FileStatus:
+    """Return values that differ after a file has changed. Raises `OSError`."""
+    status = os.stat(path)  # noqa: PTH116  a fifth of the time of Path.stat
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
 @lru_cache(maxsize=512)
-def _points(path: str, _status: tuple[int, int, int, int]) -> NDArray[np.float64]:
+def _points(path: str, _status: FileStatus) -> NDArray[np.float64]:
     mesh = read_mesh(path, Path(path).read_bytes())
     return np.unique(mesh.vertices[np.unique(mesh.faces)], axis=0)
 

@@ -264,7 +264,7 @@ class JointType(IntEnum):
 
 
 class WorldMode(Enum):
-    """The mode of Bullet: GUI opens a window, DIRECT does not."""
+    """The mode of the engine: GUI opens a window, DIRECT does not."""
 
     GUI = "GUI"
     DIRECT = "DIRECT"
@@ -280,17 +280,25 @@ class WorldError(CallerError):
 
 
 class WorldUnavailable(WorldError):
-    """Bullet cannot open a world: a window without a display, or too many worlds at once."""
+    """The engine cannot open a world: a window without a display, or too many worlds at once."""
 
 
-class BulletMissing(WorldUnavailable, MissingExtra):
-    """No Bullet is installed; the message names the command that installs it on this Python."""
+class EngineMissing(WorldUnavailable, MissingExtra):
+    """The engine of that name is not installed, or without a name none is; the message has the command to install."""
 
-    def __init__(self) -> None:
-        message = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
-        if sys.version_info >= (3, 14):
+    def __init__(self, name: str = "") -> None:
+        missing = _ENGINE_TITLES.get(name, "engine")
+        extra = "mujoco" if name == "mujoco" else "world"
+        message = f"no world can be opened, because no {missing} is installed: pip install 'pycrorm-async[{extra}]'"
+        if name == "bullet" and sys.version_info >= (3, 14):
             message += " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
         super().__init__(message)
+
+
+_ENGINE_TITLES = {"bullet": "Bullet", "mujoco": "MuJoCo"}
+
+BulletMissing = EngineMissing
+"""The former name."""
 
 
 class WorldClosed(WorldError):
@@ -326,7 +334,7 @@ class DuplicateName(WorldError):
 
 
 class DescriptionNotLoadable(WorldError):
-    """Bullet cannot load a description; `reason` names the fault."""
+    """The engine cannot load a description; `reason` names the fault."""
 
     def __init__(self, name: str, reason: str) -> None:
         super().__init__(f"the description of {name!r} cannot be loaded: {reason}")

@@ -28,18 +28,18 @@ below or above the shape. A base that overlaps no outline collides with nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.world.bounding_boxes import BoundingBox, Solid, box_around
 from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.engines import FLOOR, SKY, Floats, Part
+from pycrorm_async.world.engines import Camera as Camera  # one of the names of this module
 from pycrorm_async.world.pose import CostmapMismatch, Pose, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.world_copy import acting_robot
 
@@ -69,14 +69,18 @@ def collisions_at(
     carried object's name, and the object it collides with. The floor, the robot itself and objects attached to it do
     not count. All joints and poses are restored.
     """
-    attached = robot.world.attachments.below(robot)
-    others = [each for each in robot.world.objects if each is not robot and each not in attached]
-    collisions: list[tuple[str, Object]] = []
+    world = robot.world
+    attached = world.attachments.below(robot)
+    others = {obj.body.number: obj for obj in world.objects if obj is not robot and obj not in attached}
+    carried = tuple(carried)
+    parts = [Part(robot.body.number, link) for link in links] + [Part(obj.body.number) for obj in carried]
+    names = [*links, *(obj.name for obj in carried)]
     with _moved(robot, positions, carried, robot.pose if base is None else base):
-        for other in others:
-            collisions += [(link, other) for link in links if _overlap(robot, other, robot.body.link_number(link))]
-            collisions += [(obj.name, other) for obj in carried if _overlap(obj, other)]
-    return collisions
+        near = world.engine.nearest(parts, others, 0.0)
+    collisions = {(each.other, each.part) for each in near if each.distance_m < -TOUCH_M}
+    return [
+        (names[part], obj) for other, obj in others.items() for part in range(len(parts)) if (other, part) in collisions
+    ]
 
 
 @contextmanager
@@ -101,14 +105,6 @@ def _moved(robot: Object, positions: Mapping[str, float], carried: Iterable[Obje
             body.place(original_base)
         for obj, pose, _ in originals:
             obj.body.place(pose)
-
-
-def _overlap(one: Object, other: Object, link: int | None = None) -> bool:
-    number = {} if link is None else {"linkIndexA": link}
-    points = engine().getClosestPoints(
-        one.body.number, other.body.number, distance=0.0, physicsClientId=one.body.client, **number
-    )
-    return any(point[8] < -TOUCH_M for point in points)
 
 
 # === costmaps =================================================================================================
@@ -437,42 +433,11 @@ def _turned(points: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray
 
 # === photograph ===============================================================================================
 #
-# Photograph a world with Bullet's software renderer, which needs no display.
+# Photograph a world, without a display.
 
-_NEAR_M, _FAR_M = 0.05, 60.0
-"""The distances in m between which the camera sees."""
 _SKY = (238.0, 241.0, 245.0)
 _FLOOR_LIGHT, _FLOOR_CONTRAST = 225.0, 0.35
-"""Bullet's floor is a blue and white chessboard; it is repainted in pale greys, so that it does not outshine the
-objects."""
-
-Floats: TypeAlias = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A camera that looks at a point.
-
-    Attributes:
-        target: in "map", m.
-        distance_m: from the target.
-        yaw_deg: direction from the target to the camera: 0 along +x, 90 along +y.
-        pitch_deg: of the camera above the target's horizon.
-        view_deg: angle between the upper and the lower edge of the picture.
-    """
-
-    target: Vector
-    distance_m: float
-    yaw_deg: float
-    pitch_deg: float = 32.0
-    view_deg: float = 40.0
-
-    @property
-    def eye(self) -> Vector:
-        """The camera's position."""
-        x, y, z = _direction(self.yaw_deg, self.pitch_deg)
-        along = self.distance_m
-        return Vector(self.target.x + x * along, self.target.y + y * along, self.target.z + z * along)
+"""An engine's floor is a chessboard; it is repainted in pale greys, so that it does not outshine the objects."""
 
 
 class Photograph(NamedTuple):
@@ -492,41 +457,20 @@ class Photograph(NamedTuple):
 def photograph(world: BulletWorld, camera: Camera, width: int, height: int, *, smooth: bool = True) -> Photograph:
     """Return a picture of the world. With `smooth`, each pixel is the mean of 4 points, and objects cast shadows.
 
-    A smooth picture of 640 x 480 takes about 1 s of CPU time, one of 80 x 60 without it 10 ms.
+    A smooth picture of 640 x 480 takes about 1 s of CPU time, one of 80 x 60 without it 10 ms. Without Bullet nothing
+    casts a shadow.
     """
-    bullet, scale = engine(), 2 if smooth else 1
-    view = bullet.computeViewMatrix(camera.eye, camera.target, (0, 0, 1))
-    near = min(_NEAR_M, camera.distance_m / 10)
-    projection = bullet.computeProjectionMatrixFOV(camera.view_deg, width / height, near, _FAR_M)
-    columns, rows, colors, buffer, numbers = bullet.getCameraImage(
-        width * scale,
-        height * scale,
-        view,
-        projection,
-        shadow=int(smooth),
-        lightDirection=_direction(camera.yaw_deg + 40, 60),
-        lightColor=(1, 1, 1),
-        lightAmbientCoeff=0.55,
-        lightDiffuseCoeff=0.5,
-        lightSpecularCoeff=0,
-        renderer=bullet.ER_TINY_RENDERER,
-        physicsClientId=world.client,
-    )
-    bodies = np.reshape(numbers, (rows, columns)).astype(np.int32)
-    pixels = np.reshape(colors, (rows, columns, 4))[:, :, :3].astype(np.float64)
-    _repaint_ground(pixels, bodies, [each.body.number for each in world.objects])
+    scale = 2 if smooth else 1
+    image = world.engine.render(camera, width * scale, height * scale, shadows=smooth)
+    pixels = image.colors
+    _repaint_ground(pixels, image.bodies)
     smoothed = pixels.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
-    depths = _FAR_M * near / (_FAR_M - (_FAR_M - near) * np.reshape(buffer, (rows, columns)))
-    return Photograph(smoothed.round().astype(np.uint8), bodies[::scale, ::scale], depths[::scale, ::scale])
+    numbers, depths = image.bodies[::scale, ::scale], image.depths[::scale, ::scale]
+    return Photograph(smoothed.round().astype(np.uint8), numbers, depths)
 
 
-def _repaint_ground(pixels: Floats, bodies: NDArray[np.int32], objects: Sequence[int]) -> None:
-    pixels[bodies < 0] = _SKY
-    floor = (bodies >= 0) & ~np.isin(bodies, objects)
+def _repaint_ground(pixels: Floats, bodies: NDArray[np.int32]) -> None:
+    pixels[bodies == SKY] = _SKY
+    floor = bodies == FLOOR
     brightness = pixels[floor].mean(axis=1, keepdims=True)
     pixels[floor] = _FLOOR_LIGHT + (brightness - _FLOOR_LIGHT) * _FLOOR_CONTRAST
-
-
-def _direction(yaw_deg: float, pitch_deg: float) -> tuple[float, float, float]:
-    yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
-    return math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)

@@ -1,6 +1,6 @@
 """Read a URDF once for every use: its links, joints and shapes, and the frames to which the joints lead.
 
-A `Model` is what this package understands of a URDF: Bullet loads it (`world.bullet_body`), chains, descriptions of
+A `Model` is what this package understands of a URDF: engines load it (`world.engines`), chains, descriptions of
 robots, boxes, pages and exports are computed from it. Each number is parsed or refused with its element and its word,
 and each element that has no effect is named in `Model.left_out`.
 

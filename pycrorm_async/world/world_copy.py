@@ -42,10 +42,10 @@ def copied(world: BulletWorld) -> Iterator[BulletWorld]:
     without observers. A copy can be copied. Copying the PR2 in its kitchen takes about 25 ms.
 
     Raises:
-        WorldClosed: the world is closed. WorldUnavailable: Bullet cannot open another world.
+        WorldClosed: the world is closed. WorldUnavailable: the engine cannot open another world.
     """
-    _ = world.client
-    with BulletWorld(WorldMode.DIRECT, copy_of=world) as copy:
+    engine = type(world.engine)
+    with BulletWorld(WorldMode.DIRECT, engine=engine, copy_of=world) as copy:
         copies = {obj: _copy_object(obj, copy) for obj in world.objects}
         for each in world.attachments:
             copy.attachments.keep(Attachment(copies[each.parent], copies[each.child], each.link, each.relative))

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from pycrorm_async.cli import run as reader
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.run import plan_source
 from pycrorm_async.record.opening import PlanSource
-from tests.bullet import INSTALLED_BULLETS
+from tests.bullet import INSTALLED_ENGINES
 from tests.commands import answer, one_line_of, pycrorm, run_script
 
 # === run options ==============================================================================================
@@ -386,7 +387,7 @@ def test_run_records_the_source_and_show_and_episodes_print_it(repository: Path)
     commit = git(repository, "rev-parse", "HEAD")
     digest = hashlib.sha256(EMPTY_PLAN.encode()).hexdigest()
     assert [(each["plan_sha256"], each["git_commit"], each["git_dirty"]) for each in shown] == [(digest, commit, False)]
-    assert set(INSTALLED_BULLETS) <= set(shown[0]["libraries"])
+    assert set(INSTALLED_ENGINES) <= set(shown[0]["libraries"])
     assert shown[0]["settings"] is None
     (repository / "myplan.py").write_text(EMPTY_PLAN + "\n")
     assert pycrorm("run", "myplan.py", "--on-full", "fail", cwd=repository).returncode == 0
@@ -394,7 +395,7 @@ def test_run_records_the_source_and_show_and_episodes_print_it(repository: Path)
     assert f"commit    {commit} and uncommitted changes" in text
     assert f"(sha256 {digest[:12]}…)" in pycrorm("show", "1", cwd=repository).stdout
     assert "on_full fail" in text
-    assert all(f"{name} 3" in text for name in INSTALLED_BULLETS)
+    assert all(f"{name} {version(name)}" in text for name in INSTALLED_ENGINES)
     assert os.sep not in json.dumps(shown[0]["libraries"])
 
 

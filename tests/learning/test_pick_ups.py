@@ -41,9 +41,10 @@ from pycrorm_async.plan.failures import (
 from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.engines.bullet import library
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.urdf import PR2
+from tests.bullet import client_of
 
 # === move and pick up =========================================================================================
 #
@@ -136,7 +137,7 @@ def test_samples_for_the_scene_are_free_of_obstacles_and_see_the_object(kitchen:
 
 def nearest_furniture(stage: Stage, stand: Pose) -> float:
     """Return Bullet's distance between the kitchen and a thin post at that place, as high as the robot."""
-    bullet, client = engine(), stage.world.client
+    bullet, client = library(), client_of(stage.world)
     shape = bullet.createCollisionShape(bullet.GEOM_CYLINDER, radius=0.001, height=1.6, physicsClientId=client)
     post = bullet.createMultiBody(
         baseCollisionShapeIndex=shape, basePosition=(*stand.position[:2], 0.9), physicsClientId=client

@@ -36,7 +36,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.log import tags_of as log_tags
 from pycrorm_async.store.postgresql import GRANTS
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from tests.bullet import INSTALLED_BULLETS
+from tests.bullet import ENGINE, INSTALLED_ENGINES
 from tests.commands import answer, one_line_of, pycrorm, run_script
 from tests.databases import Server, ask, ask_to_change, change_each
 from tests.memory.note_actions import NoteActionPerformable, texts
@@ -431,7 +431,7 @@ async def test_an_episode_holds_source_libraries_settings_and_clock(database_url
         assert each.settings == {"sync_interval_ms": 20, "on_full": "fail"}
         assert each.libraries is not None
         assert each.libraries["numpy"] == version("numpy")
-        assert {"msgspec", "SQLAlchemy", "optik-py", *INSTALLED_BULLETS} <= set(each.libraries)
+        assert {"msgspec", "SQLAlchemy", "optik-py", *INSTALLED_ENGINES} <= set(each.libraries)
         assert ("pyjpt" in each.libraries) is (find_spec("jpt") is not None)  # it has no wheel for every Python
         assert each.clock_synchronized is (quality.synchronized if quality else None)
     assert "password" not in str(episode.settings)
@@ -463,7 +463,7 @@ async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(data
                 with pytest.raises(PlanFailure):
                     await PickUpActionPerformable(milk, Arms.LEFT, Grasp.TOP).perform()
                 assert await scenes() == ["pr2 (ROBOT), milk (MILK)"]  # while it runs
-        assert await scenes() == ["BulletWorld (DIRECT): pr2 (ROBOT), milk (MILK)"]
+        assert await scenes() == [f"BulletWorld (DIRECT, {ENGINE}): pr2 (ROBOT), milk (MILK)"]
 
 
 @pytest.mark.soak_on("postgresql")
@@ -485,9 +485,9 @@ async def test_a_world_that_is_entered_inside_an_episode_is_described(database_u
         await memory.flush()
         worlds = [each.world for each in await episodes_of(memory)]
     assert worlds == [
-        "BulletWorld (DIRECT): pr2 (ROBOT)",
-        "BulletWorld (DIRECT): milk (MILK)",
-        "BulletWorld (DIRECT): spoon (SPOON)",
+        f"BulletWorld (DIRECT, {ENGINE}): pr2 (ROBOT)",
+        f"BulletWorld (DIRECT, {ENGINE}): milk (MILK)",
+        f"BulletWorld (DIRECT, {ENGINE}): spoon (SPOON)",
     ]
 
 
@@ -519,7 +519,7 @@ async def test_the_world_of_an_episode_that_runs_or_is_lost_is_that_of_its_objec
                 assert await world() == "pr2 (ROBOT), milk (MILK)"
                 entered.object("pr2").remove()
             assert await world() == "pr2 (ROBOT), bowl (BOWL), milk (MILK)"
-        assert await world() == "BulletWorld (DIRECT): milk (MILK)"
+        assert await world() == f"BulletWorld (DIRECT, {ENGINE}): milk (MILK)"
 
 
 @pytest.mark.slow

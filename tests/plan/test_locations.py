@@ -431,14 +431,14 @@ def table_scene(seed: int) -> Iterator[tuple[Object, Object, Object]]:
 
 def collisions(obj: Object, links: Sequence[str] | None = None) -> set[str]:
     """Bullet's own answer: the objects that these links, or all, are in where the object is now."""
-    numbers = [obj.body.link_number(each) for each in (obj.links if links is None else links)]
+    numbers = [bullet.link_number(obj, each) for each in (obj.links if links is None else links)]
     return {
         other.name
         for other in obj.world.objects
         if other is not obj
         for number in numbers
         for point in bullet.getClosestPoints(
-            obj.body.number, other.body.number, 0.0, number, physicsClientId=obj.world.client
+            obj.body.number, other.body.number, 0.0, number, physicsClientId=bullet.client_of(obj.world)
         )
         if point[8] < -TOUCH_M
     }

@@ -152,7 +152,7 @@ def numbers(pose: Pose) -> tuple[float, ...]:
 
 def assert_pose_in_bullet(world_object: Object, pose: Pose) -> None:
     """Assert the pose of the root link in Bullet, which itself returns the centre of mass."""
-    body, client = world_object.body.number, world_object.world.client
+    body, client = world_object.body.number, bullet.client_of(world_object.world)
     facts = bullet.getDynamicsInfo(body, -1, physicsClientId=client)
     to_root = bullet.invertTransform(facts[3], facts[4])
     centre = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
@@ -164,7 +164,7 @@ def assert_pose_in_bullet(world_object: Object, pose: Pose) -> None:
 
 def joints_of_bullet(world_object: Object) -> dict[str, float]:
     """Return every joint's position in Bullet."""
-    body, client = world_object.body.number, world_object.world.client
+    body, client = world_object.body.number, bullet.client_of(world_object.world)
     return {
         bullet.getJointInfo(body, index, physicsClientId=client)[1].decode(): bullet.getJointState(
             body, index, physicsClientId=client

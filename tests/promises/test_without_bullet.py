@@ -1,4 +1,4 @@
-"""The package needs neither a Bullet nor the extras for what needs no world, and loads none of them there."""
+"""The package needs neither an engine nor the extras for what needs no world, and loads none of them there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WITHOUT_EXTRAS = """
 import sys
 from importlib.abc import MetaPathFinder
 
-EXTRAS = {"pybullet", "pycram_bullet", "optik", "jpt", "pandas", "matplotlib", "cmeel"}
+EXTRAS = {"pybullet", "pycram_bullet", "mujoco", "optik", "jpt", "pandas", "matplotlib", "cmeel"}
 
 class Absent(MetaPathFinder):
     wanted = []
@@ -111,8 +111,8 @@ def test_recording_and_every_verb_that_needs_no_world_loads_no_extra(tmp_path: P
     assert "of another executive" in done.stdout
 
 
-ABSENT = "import sys; sys.modules |= dict.fromkeys(('pybullet', 'pycram_bullet', 'optik')); "
-LINE = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
+ABSENT = "import sys; sys.modules |= dict.fromkeys(('pybullet', 'pycram_bullet', 'mujoco', 'optik')); "
+LINE = "no world can be opened, because no engine is installed: pip install 'pycrorm-async[world]'"
 
 
 REFUSED = """
@@ -164,19 +164,24 @@ def test_learn_first_names_what_to_install(tmp_path: Path) -> None:
 
 
 @pytest.mark.every_python
-def test_the_error_of_a_world_names_what_to_install_and_how_long_that_takes(tmp_path: Path) -> None:
-    opening = "from pycrorm_async.world import BulletWorld\ntry:\n    BulletWorld().__enter__()\n"
+@pytest.mark.parametrize(("engine", "title", "extra"), [("bullet", "Bullet", "world"), ("mujoco", "MuJoCo", "mujoco")])
+def test_the_error_of_a_world_names_what_to_install_for_its_engine(
+    engine: str, title: str, extra: str, tmp_path: Path
+) -> None:
+    opening = f"from pycrorm_async.world import BulletWorld\ntry:\n    BulletWorld(engine={engine!r}).__enter__()\n"
     done = run(f"{ABSENT}\n{opening}except Exception as error:\n    print(type(error).__mro__, error)", tmp_path)
-    assert all(name in done.stdout for name in ("BulletMissing", "WorldUnavailable", "MissingExtra"))
+    assert all(name in done.stdout for name in ("EngineMissing", "WorldUnavailable", "MissingExtra"))
+    line = f"no world can be opened, because no {title} is installed: pip install 'pycrorm-async[{extra}]'"
     compiling = " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
-    assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 14) else ''}\n")
+    needs_compiler = engine == "bullet" and sys.version_info >= (3, 14)
+    assert done.stdout.endswith(f" {line}{compiling if needs_compiler else ''}\n")
 
 
 @pytest.mark.every_python
 def test_a_failed_plan_names_in_one_line_what_to_install(refused: Any) -> None:
     code, printed, _ = refused[1]
     assert (code, printed.count("\n")) == (1, 1)
-    assert printed.startswith(f"pycrorm: the plan sweep.py:plan failed: BulletMissing: {LINE}")
+    assert printed.startswith(f"pycrorm: the plan sweep.py:plan failed: EngineMissing: {LINE}")
 
 
 @pytest.mark.every_python
@@ -228,10 +233,10 @@ def test_only_what_serves_an_extra_needs_it_to_be_imported(tmp_path: Path) -> No
 # Importing the plan layer.
 
 
-def test_importing_plans_loads_neither_bullet_nor_a_database() -> None:
+def test_importing_plans_loads_neither_an_engine_nor_a_database() -> None:
     code = (
         "import sys, pycrorm_async.plan as plan; assert all(hasattr(plan, name) for name in plan.__all__);"
-        "unwanted = {'pybullet', 'pycram_bullet', 'optik', 'sqlalchemy', 'pycrorm_async.events'};"
+        "unwanted = {'pybullet', 'pycram_bullet', 'mujoco', 'optik', 'sqlalchemy', 'pycrorm_async.events'};"
         "unwanted.add('pycrorm_async.record');"
         "print(sorted(unwanted & set(sys.modules)))"
     )

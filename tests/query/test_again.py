@@ -409,7 +409,7 @@ def test_a_description_that_does_not_fit_the_recorded_state_is_refused(
         assert current_world.get() is outer
         assert not world.entered
         with pytest.raises(WorldClosed):
-            _ = world.client
+            _ = world.engine
 
 
 def test_an_impossible_snapshot_is_refused_in_one_line() -> None:

@@ -90,7 +90,7 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
 
 def bullet_frame(target: Object, link: str) -> Matrix:
     """Return the link's frame in the map as a 4 by 4 matrix."""
-    number, client = target.body.number, target.world.client
+    number, client = target.body.number, bullet.client_of(target.world)
     names = [
         bullet.getJointInfo(number, joint, physicsClientId=client)[12].decode()
         for joint in range(bullet.getNumJoints(number, physicsClientId=client))

@@ -19,12 +19,12 @@ from pycrorm_async.world import (
     RobotDescription,
     describe_robot,
 )
-from pycrorm_async.world.bullet_body import engine
 from pycrorm_async.world.kinematics import solve
 from pycrorm_async.world.pose import ObjectRefused, UnknownLink, yaw_quaternion
 from pycrorm_async.world.queries import collisions_at, footprint_of
 from pycrorm_async.world.urdf import Limits
 from pycrorm_async.world.world_copy import copied, counterpart
+from tests import bullet
 from tests.world.fakes import HEIGHT_M, RAILS, ChangeLog, link_poses, rail_robot, raised_robot
 
 LEANING = Pose([0.3, -1.2, 0.7], [0.2, -0.4, 0.1, 0.8])
@@ -190,5 +190,5 @@ def test_a_base_link_that_the_model_lacks_is_refused(world: BulletWorld) -> None
     with pytest.raises(ObjectRefused, match="only a robot has a base link"):
         Object("milk", ObjectType.MILK, base_link="milk")
     assert world.objects == ()
-    assert engine().getNumBodies(physicsClientId=world.client) == 1  # the floor
+    assert bullet.getNumBodies(physicsClientId=bullet.client_of(world)) == 1  # the floor
     assert describe_robot("robot", raised_robot().urdf or "", base_link="base_link").base_link == "base_link"

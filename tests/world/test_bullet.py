@@ -16,7 +16,7 @@ import pytest
 import pycrorm_async.world as worlds
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
-from pycrorm_async.world.bullet_body import WorldState
+from pycrorm_async.world.body import WorldState
 from pycrorm_async.world.pose import (
     JointLimitExceeded,
     ObjectNotInWorld,
@@ -26,6 +26,7 @@ from pycrorm_async.world.pose import (
     WorldError,
     WorldUnavailable,
 )
+from tests.bullet import ENGINE
 from tests.world.fakes import CRANE, ChangeLog
 
 # === bullet ===================================================================================================
@@ -140,7 +141,7 @@ def test_a_world_must_be_entered_before_objects_are_added() -> None:
 
 def test_a_window_without_a_display_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(WorldUnavailable, match="DISPLAY"), BulletWorld(mode=WorldMode.GUI):
+    with pytest.raises(WorldUnavailable, match="DISPLAY"), BulletWorld(WorldMode.GUI, engine="bullet"):
         pytest.fail("entered")
     assert current_world.get() is None
 
@@ -199,7 +200,7 @@ def test_objects_are_listed_by_name_and_in_order(world: BulletWorld, change_log:
     assert world.robot is robot
     with pytest.raises(ObjectNotInWorld, match="'spoon' is not in the world; its objects are: bowl, mover"):
         world.object("spoon")
-    assert world.description == "BulletWorld (DIRECT): bowl (BOWL), mover (ROBOT)"
+    assert world.description == f"BulletWorld (DIRECT, {ENGINE}): bowl (BOWL), mover (ROBOT)"
     world.remove(robot)
     assert world.robot is None
     assert [entry[:2] for entry in change_log.notes] == [("added", "bowl"), ("added", "mover"), ("removed", "mover")]

@@ -26,6 +26,7 @@ from pycrorm_async.world.pose import (
     UnknownLink,
 )
 from pycrorm_async.world.urdf import PR2
+from tests import bullet
 from tests.world.fakes import CRANE, ChangeLog, crane_links, matrix
 
 # === objects ==================================================================================================
@@ -274,10 +275,9 @@ def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, change_l
 
 
 def test_a_colour_is_applied_to_every_link(world: BulletWorld) -> None:
-    from pycrorm_async.world.bullet_body import engine
 
     milk = Object("milk", ObjectType.MILK, color=(1.0, 0.0, 0.5, 1.0))
-    shapes = engine().getVisualShapeData(milk.body.number, physicsClientId=world.client)
+    shapes = bullet.getVisualShapeData(milk.body.number, physicsClientId=bullet.client_of(world))
     assert [shape[7] for shape in shapes] == [(1.0, 0.0, 0.5, 1.0)]
 
 

@@ -253,8 +253,8 @@ def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld
             point[8] < -1e-3
             for table in tables
             for point in bullet.getClosestPoints(
-                robot.body.number, table.body.number, 0.0, robot.body.link_number("base_link"),
-                physicsClientId=world.client,
+                robot.body.number, table.body.number, 0.0, bullet.link_number(robot, "base_link"),
+                physicsClientId=bullet.client_of(world),
             )
         )  # fmt: skip
         counts[hit] += 1

@@ -46,7 +46,7 @@ def test_a_copy_has_everything_of_the_world(yard: BulletWorld) -> None:
     before = yard.save_state()
     with copied(yard) as copy:
         assert copy is not yard
-        assert copy.client != yard.client
+        assert copy.engine is not yard.engine
         for thing, twin in zip(yard.objects, copy.objects, strict=True):
             assert twin is not thing
             assert (twin.name, twin.object_type, twin.world) == (thing.name, thing.object_type, copy)
