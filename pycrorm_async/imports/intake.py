@@ -24,7 +24,7 @@ import msgspec
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import episode_text, named_episode_id
-from pycrorm_async.events.types import EpisodeStatus, FieldDeclared, NodeStatus, PoseValue
+from pycrorm_async.events.types import EpisodeStatus, FieldDeclared, NodeStatus, ObjectValue, PoseValue
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.record.declarations import FieldSpec
 from pycrorm_async.record.plan_types import built_in_declaration
@@ -98,7 +98,7 @@ class EpisodeReport:
         nodes, objects: the number of nodes and of objects.
         changes: the number of moves of objects and of joints.
         removals: the number of objects that left the world.
-        samples: the number of blocks of samples.
+        samples: the number of samples of streams.
         observations: the number of observations.
         statuses: how many nodes ended with each status.
     """
@@ -164,6 +164,7 @@ class Intake:
         plan: str | None = None,
         tags: Sequence[str] = (),
         metadata: Mapping[str, Any] = {},
+        created_by: str | None = None,
     ) -> IntakeEpisode:
         """Open an episode; use it with `with`.
 
@@ -186,6 +187,7 @@ class Intake:
                 plan=plan,
                 tags=(*settings.tags, *(each for each in tags if each not in settings.tags)),
                 metadata={"import": format_name, **metadata},
+                created_by=created_by,
             )
         if identity in self._stored or (recorded is not None and recorded.is_recorded):
             report.state = "already stored"
@@ -365,6 +367,15 @@ class IntakeEpisode:
         if self._recorded is not None:
             self._recorded.joints_moved(key, changed, at=at)
 
+    def sampled(self, name: str, channels: Sequence[str], values: Sequence[Numbers], at: Sequence[int]) -> None:
+        """Record samples of a stream: for each time, a number for each channel."""
+        if not at or self.is_stored:
+            return
+        self._last = max(self._last, at[-1])
+        self._report.samples += len(at)
+        if self._recorded is not None:
+            self._recorded.sampled(name, channels, values, at)
+
     def observe(self, name: str, values: object, at: int, *, node: Hashable | None = None) -> None:
         """Record an observation, of the node if that is open, else of the episode."""
         self._last = max(self._last, at)
@@ -412,6 +423,8 @@ def _recorded(value: Any, known: FieldDeclared | None) -> tuple[FieldSpec, Any]:
             return "text", value
         case ObjectKey():
             return "object", value.key
+        case ObjectValue():
+            return "object", value
         case PoseValue():
             return "pose", value
         case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation, **rest} if (

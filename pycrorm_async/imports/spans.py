@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
@@ -23,6 +24,7 @@ class Span:
     Attributes:
         key: names it in its episode.
         start, end: in ns since 1970; without an end it ends with its episode, or after the last of the other nodes.
+        late: returns further parameters when the node starts, and takes the episode.
         parent: the key of the node it is inside; the root takes the place of one that is not in the file.
         failure: reason and message.
         instants: observations of it: time, name, values.
@@ -39,6 +41,7 @@ class Span:
     failure: tuple[str, str] | None = None
     result: Any = None
     instants: Sequence[tuple[int, str, object]] = ()
+    late: Callable[[IntakeEpisode], Mapping[str, Any]] | None = None
 
 
 def nest(spans: Iterable[Span]) -> None:
@@ -56,14 +59,12 @@ def _end_of(span: Span) -> int:
 
 
 def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[Other] = ()) -> None:
-    """Give a tree of spans to an episode, and what else happened, in the order of time.
+    """Give a tree of spans to an episode, and what else happened, which must be in the order of time.
 
     A span whose clock was behind that of its parent starts after it, at its own time.
     """
     places = _places(spans)
-    steps: list[tuple[int, int, int, int, Any]] = [
-        (each[0], OTHER, 0, index, each) for index, each in enumerate(others)
-    ]
+    steps: list[tuple[int, int, int, int, Any]] = []
     last = max((_end_of(each) for each in spans if each.end is not None), default=0)
     for index, span in enumerate(spans):
         begin, depth = places[span.key]
@@ -72,18 +73,25 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[O
         end = last if span.end is None and span.status != "UNKNOWN" else span.end
         if end is not None:
             steps.append((max(end, begin), END if end > begin else EMPTY_END, -depth, index, span))
-    for _at, phase, _depth, _index, what in sorted(steps, key=lambda each: each[:4]):
+    further = ((each[0], OTHER, 0, index, each) for index, each in enumerate(others))
+    for _at, phase, _depth, _index, what in heapq.merge(sorted(steps, key=_order), further, key=_order):
         if phase == OTHER:
             at, give = what
             give(at)
         elif phase == START:
             parent = what.parent if what.parent in places else None
-            episode.start(what.key, what.kind, what.dtype, what.parameters, what.start, parent=parent)
+            parameters = what.parameters if what.late is None else {**what.parameters, **what.late(episode)}
+            episode.start(what.key, what.kind, what.dtype, parameters, what.start, parent=parent)
         elif phase == INSTANT:
             span, (at, name, values) = what
             episode.observe(name, values, at, node=span.key)
         else:
-            episode.end(what.key, what.status, what.end or last, failure=what.failure, result=what.result)
+            is_timed, at = what.end is not None, what.end or last
+            episode.end(what.key, what.status, at, failure=what.failure, result=what.result, untimed=not is_timed)
+
+
+def _order(step: tuple[int, int, int, int, Any]) -> tuple[int, int, int, int]:
+    return step[:4]
 
 
 def _places(spans: Sequence[Span]) -> dict[Hashable, tuple[int, int]]:

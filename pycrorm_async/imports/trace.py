@@ -25,6 +25,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -190,7 +191,8 @@ def _read_events(path: Path, document: Mapping[str, Any], settings: TraceMap, in
         metadata={"file": path.name, **({"names": sorted(reader.names)} if reader.names else {})},
     )
     with episode:
-        give_spans(episode, spans, [(at, partial(give, episode)) for at, give in reader.others])
+        others = sorted(reader.others, key=itemgetter(0))
+        give_spans(episode, spans, [(at, partial(give, episode)) for at, give in others])
         episode.ended(own.get("status") or "UNKNOWN", _time(own.get("end_ns")))
     intake.progress(len(events), len(events))
 

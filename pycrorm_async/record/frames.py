@@ -30,13 +30,16 @@ class Frames:
 
     def in_map(self, pose: PoseValue) -> PoseValue:
         """Return the pose in the map; the same one if the places of its frame and of those above are not all known."""
+        composed = self.in_root(pose)
+        return composed if composed.frame == MAP else pose
+
+    def in_root(self, pose: PoseValue) -> PoseValue:
+        """Return the pose in the topmost frame above its own that is known; the same one in a circle of frames."""
         composed = pose
         for _ in range(_DEPTH_MAX):
-            if composed.frame == MAP:
-                return composed
-            above = self._places.get(composed.frame)
+            above = self._places.get(composed.frame) if composed.frame != MAP else None
             if above is None:
-                return pose
+                return composed
             turned = rotated(above.orientation, composed.position)
             x, y, z = (place + way for place, way in zip(above.position, turned, strict=True))
             qx, qy, qz, qw = product(above.orientation, composed.orientation)

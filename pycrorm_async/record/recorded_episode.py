@@ -723,7 +723,8 @@ class RecordedEpisode(EpisodeWriter):
         self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure, world))
 
     def _end_now(self, failure: BaseException | None, world: str | None) -> None:
-        if is_named(self.id) and not self.closed and self._end_statuses(failure)[0] == "INTERRUPTED":
+        is_interrupted = self._end_status is None and self._end_statuses(failure)[0] == "INTERRUPTED"
+        if is_named(self.id) and not self.closed and is_interrupted:
             self.closed = self._is_ended = True
             return
         if not self.closed:
