@@ -14,9 +14,10 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Container, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias, cast, get_args
 
@@ -40,6 +41,8 @@ built-in type has; further parameters are JSON in the field `further`."""
 _IDENTITY_BYTES = 2**20
 """The bytes at both ends of a file that identify it, so that a large bag is not read twice."""
 
+_ENDED_MAX = 20
+"""Bounds the nodes that can still have observations after their end; the recording knows the last 1,000."""
 _WORDS = re.compile(r"[A-Za-z0-9]+")
 _NAME_MAX = 50
 """Bounds the characters of the name of a type or a field: PostgreSQL cuts names of tables at 63 bytes."""
@@ -98,7 +101,7 @@ class EpisodeReport:
         nodes, objects: the number of nodes and of objects.
         changes: the number of moves of objects and of joints.
         removals: the number of objects that left the world.
-        samples: the number of samples of streams.
+        samples: the number of samples of streams, such as joint states.
         observations: the number of observations.
         statuses: how many nodes ended with each status.
     """
@@ -250,6 +253,7 @@ class IntakeEpisode:
         self._recorded = recorded
         self._last = at
         self._open: dict[Hashable, None] = {}
+        self._ended: deque[Hashable] = deque(maxlen=_ENDED_MAX)
         self._poses: dict[Hashable, tuple[float, ...]] = {}
         self._joints: dict[Hashable, dict[str, float]] = {}
         self._status: EpisodeStatus = "UNKNOWN"
@@ -299,6 +303,7 @@ class IntakeEpisode:
         if key not in self._open:
             return
         del self._open[key]
+        self._ended.append(key)
         self._report.statuses[status] += 1
         if self._recorded is not None:
             self._recorded.end(key, status, failure, result, at=at, untimed=untimed)
@@ -367,23 +372,26 @@ class IntakeEpisode:
         if self._recorded is not None:
             self._recorded.joints_moved(key, changed, at=at)
 
-    def sampled(self, name: str, channels: Sequence[str], values: Sequence[Numbers], at: Sequence[int]) -> None:
-        """Record samples of a stream: for each time, a number for each channel."""
-        if not at or self.is_stored:
+    def sampled(self, stream: str, channels: Sequence[str], values: Any, at: Sequence[int]) -> None:
+        """Record samples of a stream: a row of numbers, one for each channel, for each time."""
+        if len(at) == 0:
             return
-        self._last = max(self._last, at[-1])
+        self._last = max(self._last, int(max(at)))
+        if self.is_stored:
+            return
         self._report.samples += len(at)
         if self._recorded is not None:
-            self._recorded.sampled(name, channels, values, at)
+            self._recorded.sampled(stream, channels, values, at)
 
     def observe(self, name: str, values: object, at: int, *, node: Hashable | None = None) -> None:
-        """Record an observation, of the node if that is open, else of the episode."""
+        """Record an observation, of the node if that is open or ended a short time ago, else of the episode."""
         self._last = max(self._last, at)
         if self.is_stored:
             return
         self._report.observations += 1
         if self._recorded is not None:
-            self._recorded.observe(name, values, node=node if node in self._open else None, at=at)
+            known = node if node in self._open or node in self._ended else None
+            self._recorded.observe(name, values, node=known, at=at)
 
     def ended(self, status: object, at: int | None = None) -> None:
         """Set how the episode ended, and when, if that is after its last event; by default UNKNOWN."""
@@ -451,6 +459,12 @@ def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map"
     x, y, z = map(float, position)
     qx, qy, qz, qw = map(float, orientation)
     return PoseValue((x, y, z), (qx, qy, qz, qw), frame, at)
+
+
+def ns_of(moment: datetime) -> int:
+    """Return a time of a map file; one without a zone is in UTC."""
+    aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return int((aware - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(microseconds=1)) * 1000
 
 
 def identity_of(path: Path, *further: Path) -> str:

@@ -27,7 +27,13 @@ from pycrorm_async.record.recording import Recording
 
 GROUP: Final = "pycrorm.import_formats"
 """The group of the entry points of formats."""
-_BUILT_IN: Final = {"trace": "trace", "btlog": "btlog", "neem": "neem"}
+_BUILT_IN: Final = {
+    "trace": "trace",
+    "btlog": "btlog",
+    "mcap": "bags",
+    "rosbag2": "bags",
+    "neem": "neem",
+}
 """The modules of the built-in formats, by name, loaded when they are used. `FORMAT` in each is its `ImportFormat`."""
 
 

@@ -23,7 +23,7 @@ import re
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -205,7 +205,7 @@ def _zero_ns(
         if known is not None:
             return known
     if settings.start is not None:
-        return _ns_of(settings.start)
+        return intakes.ns_of(settings.start)
     times = (each["ts"] for each in events if isinstance(each, dict) and isinstance(each.get("ts"), int | float))
     if all(int(each) in _EPOCH_US for each in times if each):
         return 0
@@ -390,12 +390,6 @@ def _change(own: Mapping[str, Any]) -> _Give:
 def _time(value: Any) -> int | None:
     """Return a time in ns since 1970; None for another value, and one that 64 bits do not hold."""
     return value if isinstance(value, int) and not isinstance(value, bool) and value in _TIMES_NS else None
-
-
-def _ns_of(moment: datetime) -> int:
-    """Return a time of a map file; one without a zone is in UTC."""
-    aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    return int((aware - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(microseconds=1)) * 1000
 
 
 # === otlp =====================================================================================================

@@ -48,6 +48,7 @@ NOT_RUN: Final = {
     "pip install 'pycrorm-async[live]'": "the index has no version of this package; the extra `test` installs the same",
     "pip install datasette": "installs; `test_row_exports.py` compares the metadata with the tables",
     "datasette -i": "needs Datasette",
+    'robot = "tiago"': "a map file; `test_bags.py` reads it",
     "ssh -L": "needs a second computer",
     "[Service]": "needs systemd; `test_pages.py` looks up the command that it starts",
     '{\n  "mcpServers"': "names a folder of the reader's; `test_mcp_server.py` starts the same command",
