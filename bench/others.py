@@ -1,15 +1,12 @@
 """Store the same events with this package, with other libraries, and with plain SQL.
 
-    python -m bench.others             100,000 events into SQLite and PostgreSQL, 20,000 into queues; three turns each
+    python -m bench.others             100,000 events into SQLite and PostgreSQL; three turns each
     python -m bench.others --quick     1,000 events, one turn
 
-*Into the database*: one process commits all events. This package reads them from the spool of a dead recorder; for the
-libraries they are objects in memory, passed in the batches that were fastest: 1,000 a call for `eventsource-py`, 5,000
-for `eventsourcing` (1,000 on PostgreSQL). Plain SQL writes the rows of our log, 10,000 a transaction, by `executemany`,
-`json_each` and COPY.
-
-*Into a durable queue*: events are put one by one, each until it survives the death of the process. The cost of
-encoding, checksum and memory copy alone is a lower bound for every queue.
+One process commits all events. This package reads them from the spool of a dead recorder; for the libraries they are
+objects in memory, passed in the batches that were fastest: 1,000 a call for `eventsource-py`, 5,000 for `eventsourcing`
+(1,000 on PostgreSQL). Plain SQL writes the rows of our log, 10,000 a transaction, by `executemany`, `json_each` and
+COPY. `bench.rivals` compares putting events one by one.
 
 All contenders take turns. A library that is not installed is reported as missing (`pip install '.[bench]'`). The script
 prints one JSON line: events a second (median, minimum, maximum), and our rate divided by theirs.
@@ -22,16 +19,13 @@ import asyncio
 import importlib
 import itertools
 import json
-import mmap
-import os
 import shutil
 import signal
 import sqlite3
 import tempfile
 import time
 import uuid
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -44,12 +38,11 @@ from rich.table import Table
 from sqlalchemy.engine import make_url
 from sqlalchemy.ext.asyncio import create_async_engine
 
-from bench.material.rollouts import Recording, spool_tree, tree
+from bench.material.rollouts import spool_tree, tree
 from bench.reporting.figures import MISSING, console, spread
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.codec import Heading, Record, decode, encode
-from pycrorm_async.events.types import Happening
+from pycrorm_async.events.codec import Record
 from pycrorm_async.operations.destination import open_destination
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.settings import Settings
@@ -88,9 +81,6 @@ Contender = Callable[[Material, str], float]
 
 def _batches(values: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
     return (values[first : first + size] for first in range(0, len(values), size))
-
-
-# --- into the database ----------------------------------------------------------------------------------------------
 
 
 def ours(material: Material, url: str) -> float:
@@ -248,70 +238,6 @@ def _create_log(url: str) -> None:
     asyncio.run(create())
 
 
-# --- into a durable queue -------------------------------------------------------------------------------------------
-
-
-def our_queue(material: Material, _url: str) -> float:
-    recording = Recording(Path(tempfile.mkdtemp(dir=material.folder)) / "spool", live=True)
-    began = time.perf_counter()
-    put = recording.queue.put_nowait
-    for each in material.records:
-        put(Heading(each.episode, each.type, each.version), each.payload)
-    took = time.perf_counter() - began
-    recording.leave()
-    return took
-
-
-def encode_checksum_and_copy(material: Material, _url: str) -> float:
-    """Encode each event, compute its checksum and copy both into a mapped file; every queue on disk must do this."""
-    events: list[Happening] = [decode(each.type, each.payload, each.version) for each in material.records]
-    size = sum(len(each.payload) + 8 for each in material.records)
-    with (material.folder / "raw").open("w+b") as file:
-        os.posix_fallocate(file.fileno(), 0, size)
-        with mmap.mmap(file.fileno(), size) as memory:
-            began = time.perf_counter()
-            start = 0
-            for event in events:
-                payload = encode(event)
-                end = start + 8 + len(payload)
-                memory[start:end] = zlib.crc32(payload).to_bytes(8, "little") + payload
-                start = end
-            return time.perf_counter() - began
-
-
-def persist_queue_sqlite(material: Material, _url: str) -> float:
-    persistqueue = importlib.import_module("persistqueue")
-    queue = persistqueue.SQLiteQueue(tempfile.mkdtemp(dir=material.folder), auto_commit=True)
-    return _put_all(queue.put, material.records)
-
-
-def persist_queue_file(material: Material, _url: str) -> float:
-    persistqueue = importlib.import_module("persistqueue")
-    queue = persistqueue.Queue(tempfile.mkdtemp(dir=material.folder))
-    return _put_all(queue.put, material.records)
-
-
-def sqlite_autocommit(material: Material, _url: str) -> float:
-    """Commit each event; with WAL and synchronous=NORMAL it survives power loss only after a checkpoint."""
-    connection = sqlite3.connect(f"{tempfile.mkdtemp(dir=material.folder)}/queue.db", isolation_level=None)
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = NORMAL")
-    connection.execute("CREATE TABLE queue (id INTEGER PRIMARY KEY, type TEXT, payload BLOB)")
-
-    def put(record: tuple[str, bytes]) -> None:
-        connection.execute("INSERT INTO queue (type, payload) VALUES (?, ?)", record)
-
-    return _put_all(put, material.records)
-
-
-def _put_all(put: Callable[[tuple[str, bytes]], Any], records: Iterable[Record]) -> float:
-    values = [(each.type, each.payload) for each in records]
-    began = time.perf_counter()
-    for value in values:
-        put(value)
-    return time.perf_counter() - began
-
-
 # --- all contenders -------------------------------------------------------------------------------------------------
 
 CONTENDERS: dict[str, dict[str, Contender]] = {
@@ -328,13 +254,6 @@ CONTENDERS: dict[str, dict[str, Contender]] = {
         "executemany": raw_executemany_postgresql,
         "eventsource-py": eventsource_py,
         "eventsourcing": eventsourcing,
-    },
-    "queue": {
-        "ours": our_queue,
-        "encode + checksum + copy": encode_checksum_and_copy,
-        "persist-queue, SQLite": persist_queue_sqlite,
-        "persist-queue, file": persist_queue_file,
-        "sqlite3 autocommit": sqlite_autocommit,
     },
 }
 
@@ -402,13 +321,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="1,000 events, one turn")
     parser.add_argument("--events", type=int, default=100_000)
-    parser.add_argument("--queued", type=int, default=20_000)
     parser.add_argument("--turns", type=int, default=3)
     arguments = parser.parse_args()
-    events, queued, turns = (
-        (1_000, 1_000, 1) if arguments.quick else (arguments.events, arguments.queued, arguments.turns)
-    )
-    packages = ("eventsource-py", "eventsourcing", "persist-queue", "asyncpg", "psycopg")
+    events, turns = (1_000, 1) if arguments.quick else (arguments.events, arguments.turns)
+    packages = ("eventsource-py", "eventsourcing", "asyncpg", "psycopg")
     collect_seldom()  # as in `pycrorm writer`; applies to all contenders
     signal.signal(signal.SIGALRM, _raise_timeout)
     result: dict[str, Any] = {
@@ -421,7 +337,7 @@ def main() -> None:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
             server = stack.enter_context(server_in(folder / "pg")) if target == "postgresql" else None
-            material = material_of(queued if target == "queue" else events, folder)
+            material = material_of(events, folder)
             numbers = itertools.count()
             rates = measure(contenders, material, turns, partial(_new_url, folder, server, numbers))
             result[target] = {"events": len(material.records), **rates}

@@ -1,10 +1,12 @@
 """Compare a plan with a memory and the same plan without: navigate, face, look and try to pick up, without pauses.
 
     python -m bench.plan               ten turns of 300 rollouts
+    python -m bench.plan --turns 3     fewer of them
     python -m bench.plan --quick       two short turns
 
-The script prints one JSON line: rollouts a second without a memory, with a writer thread, and with a daemon that runs
-at the same time; the cost of both writers; and the number of events in a rollout. The three variants take turns.
+The script prints one JSON line: rollouts a second without a memory, with a writer thread, with a writer process, and
+with a daemon; what each writer costs, as a share of the rollout and in µs of the plan's thread; and the number of
+events in a rollout. The variants take turns, and a turn begins when its writer is ready.
 """
 
 import asyncio
@@ -29,7 +31,7 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Po
 
 QUICK = "--quick" in sys.argv
 ROLLOUTS = 10 if QUICK else 300
-TURNS = 2 if QUICK else 10
+TURNS = 2 if QUICK else int(sys.argv[2]) if sys.argv[1:2] == ["--turns"] else 10
 
 
 class Duration(NamedTuple):
@@ -69,14 +71,15 @@ async def turn(url: str | None, seed: int, *, writer: Writer = "thread") -> Dura
 
 
 async def measure() -> dict[str, object]:
-    with_memory, by_daemon, without = [], [], []
+    without: list[Duration] = []
+    by_writer: dict[Writer, list[Duration]] = {"thread": [], "process": [], "daemon": []}
     with tempfile.TemporaryDirectory() as folder:
         url = f"sqlite:///{folder}/daemon.db"
         daemon = start_daemon(url, Path(f"{folder}/daemon.db.spool"))
         for seed in range(TURNS):
             without.append(await turn(None, seed))
-            with_memory.append(await turn(f"sqlite:///{folder}/bench.db", seed))
-            by_daemon.append(await turn(url, seed, writer="daemon"))
+            for writer, turns in by_writer.items():
+                turns.append(await turn(f"sqlite:///{folder}/{writer}.db", seed, writer=writer))
         stop(daemon)
         with closing(sqlite3.connect(f"{folder}/daemon.db")) as file:
             [(events,)] = file.execute("SELECT count(*) FROM event")
@@ -86,8 +89,7 @@ async def measure() -> dict[str, object]:
         "turns": TURNS,
         "rollouts_per_s_without": rate(without),
         "events_a_rollout": round(events / TURNS / ROLLOUTS, 1),
-        "with_thread": {"rollouts_per_s": rate(with_memory), **cost(with_memory, without)},
-        "with_daemon": {"rollouts_per_s": rate(by_daemon), **cost(by_daemon, without)},
+        **{f"with_{writer}": cost(turns, without) for writer, turns in by_writer.items()},
     }
 
 
@@ -99,10 +101,13 @@ def cost(turns: list[Duration], without: list[Duration]) -> dict[str, object]:
     """Return the additional time as a share of the turn without memory; other processes hardly affect CPU shares."""
     wall = [one.wall / other.wall - 1 for one, other in zip(turns, without, strict=True)]
     thread = [one.thread / other.thread - 1 for one, other in zip(turns, without, strict=True)]
+    more_s = min(each.thread for each in turns) - min(each.thread for each in without)
     return {
+        "rollouts_per_s": rate(turns),
         "slower_by_median": round(statistics.median(wall), 3),
         "slower_by_each": [round(each, 3) for each in wall],
         "plan_thread_busier_by_median": round(statistics.median(thread), 3),
+        "us_a_rollout": round(more_s / ROLLOUTS * 1e6),
     }
 
 

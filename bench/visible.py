@@ -1,4 +1,4 @@
-"""Measure the time from the return of a `perform` until its rows are visible, when a daemon writes them.
+"""Measure the time from the return of a `perform` until its rows are visible, when a process of its own writes them.
 
     python -m bench.visible            at 100, 1,000 and 10,000 events a second, 10 s each; SQLite and PostgreSQL
     python -m bench.visible --quick    at 100 and 1,000, half a second each
@@ -28,7 +28,6 @@ from typing import Any
 import asyncpg
 from rich.table import Table
 
-from bench.daemon import start_daemon, stop
 from bench.reporting.figures import console, percentiles
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
@@ -51,10 +50,10 @@ async def record(url: str, spool: Path, rate: int, seconds: float) -> dict[str, 
     """Record at one rate, and return the latencies of the performs."""
     returned_ns: list[int] = []
     performs = max(1, round(rate / 2 * seconds))
-    async with Memory.open(url, spool=spool, writer="daemon") as memory:
+    async with Memory.open(url, spool=spool, writer="process") as memory:
         async with memory.episode(description="bench"):
             await NoteActionPerformable("first", 0.0).perform()
-            await memory.flush()  # the daemon has discovered this recorder
+            await memory.flush()  # the writer process is ready
             first = ask(url, "SELECT head FROM episode ORDER BY number DESC LIMIT 1")[0][0]
             watcher = _start_watching(url)
             begin_s = time.perf_counter()
@@ -123,11 +122,7 @@ def measure(rates: tuple[int, ...], seconds: float, stack: ExitStack) -> dict[st
             console().print(f"{database}, {rate:,} events/s …")
             url = server.new_database() if database == "postgresql" else f"sqlite:///{folder}/{rate}.db"
             spool = folder / f"{database}{rate}.spool"
-            daemon = start_daemon(url, spool)
-            try:
-                result[database][str(rate)] = asyncio.run(record(url, spool, rate, seconds))
-            finally:
-                stop(daemon)
+            result[database][str(rate)] = asyncio.run(record(url, spool, rate, seconds))
     return result
 
 
