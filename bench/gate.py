@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import gc
-import importlib.util
 import json
 import logging
 import os
@@ -38,6 +37,7 @@ from bench.material.turns import nothing_action
 from bench.reporting.figures import console
 from pycrorm_async import Memory, Settings
 from pycrorm_async.bulk_records import collect_seldom
+from pycrorm_async.core import IS_COMPILED
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.plan.execution import recorder
@@ -204,8 +204,7 @@ def _copy_schema(file: Path, copy: sqlite3.Connection) -> dict[str, list[Any]]:
 
 def core() -> str:
     """Return which core of the queue this process uses."""
-    compiled = importlib.util.find_spec("pycrorm_async.queue._core") is not None
-    return "compiled" if compiled and not os.environ.get("PYCRORM_PURE") else "pure"
+    return "compiled" if IS_COMPILED else "pure"
 
 
 def ratios(least_us: dict[str, float]) -> dict[str, float]:
