@@ -12,9 +12,9 @@ Users also import from `pycrorm_async.plan` (designators), `pycrorm_async.world`
 loads its module on first use.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pycrorm_async.lazy_names import lazy_names
 from pycrorm_async.moved_modules import keep_former_paths
 
 if TYPE_CHECKING:
@@ -49,32 +49,25 @@ __all__ = [
     "world_of",
 ]
 
-_MODULES = {
-    "Blob": "events.types",
-    "EpisodeProjection": "projections.custom",
-    "Memory": "memory",
-    "MemoryStatus": "memory",
-    "Projection": "projections.custom",
-    "PycrormError": "errors",
-    "Reading": "query.reading",
-    "RecordedEvent": "record.event_feed",
-    "Settings": "settings",
-    "UserView": "projections.mapped_tables",
-    "performable_of": "query.again",
-    "recover": "operations.recovery",
-    "with_tree": "record.plan_recorder",
-    "world_of": "query.again",
-}
-
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "errors": "PycrormError",
+        "events.types": "Blob",
+        "memory": "Memory MemoryStatus",
+        "operations.recovery": "recover",
+        "projections.custom": "EpisodeProjection Projection",
+        "projections.mapped_tables": "UserView",
+        "query.again": "performable_of world_of",
+        "query.reading": "Reading",
+        "record.event_feed": "RecordedEvent",
+        "record.plan_recorder": "with_tree",
+        "settings": "Settings",
+    },
+)
 
 keep_former_paths()
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return sorted({*globals(), *__all__})

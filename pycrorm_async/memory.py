@@ -16,6 +16,10 @@
 
 The thread ends with the process if the memory is never closed; its events are then in the spool, and the next memory
 of that database stores them.
+
+**Loading.** Importing this module loads what records events. The packages that read memories, recall and report are
+loaded when a memory is first asked, the plan layer when a plan is first recorded, and the projections when a memory is
+opened with a writer thread (`lazy_names`).
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -32,90 +37,168 @@ from contextlib import (
     ExitStack,
     asynccontextmanager,
     contextmanager,
-    suppress,
 )
 from dataclasses import replace
 from functools import partial, wraps
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Concatenate, Final, NamedTuple, ParamSpec, Self, TypeVar, cast
 
-from sqlalchemy import Select
-
-from pycrorm_async import __version__
+from pycrorm_async import __version__, connected_var, operations, record
+from pycrorm_async import projections as folding
+from pycrorm_async import query as reading_side
+from pycrorm_async import recall as recalling
+from pycrorm_async import report as reporting
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.connected_var import ConnectedVar, set_inside
+from pycrorm_async.connected_var import ConnectedVar, Late, set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign, TablesPending
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import episode_id
-from pycrorm_async.operations.copy import tag_episode
-from pycrorm_async.operations.destination import expected_log, open_destination
-from pycrorm_async.operations.recovery import dead_queues
-from pycrorm_async.operations.stored_episodes import LogEpisodes
-from pycrorm_async.operations.writer_process import WriterAssignment, WriterProcess, WriterProcessState
-from pycrorm_async.plan.execution import called_performs, recorder
-from pycrorm_async.plan.task import TaskTreeNode, experience
-from pycrorm_async.projections.custom import Projection, validate_projections
-from pycrorm_async.projections.generations import current_generation
-from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.question import AskedEpisode, Question, SyncQuestion
-from pycrorm_async.query.questions import Ask
-from pycrorm_async.query.reading import Reading, memory_html
-from pycrorm_async.query.samples import samples
-from pycrorm_async.query.success import plot_success
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
-from pycrorm_async.recall.answer import Answer
-from pycrorm_async.recall.experience import PickUpExperience
-from pycrorm_async.recall.recall import CaseReader, DatabaseSource, ProcessCases, Recall
 from pycrorm_async.record.declarations import KnownTypes
 from pycrorm_async.record.episode_writer import Emitter, Faults, OpenEpisodes
 from pycrorm_async.record.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 from pycrorm_async.record.opening import PlanSource, Provenance, read_labels
-from pycrorm_async.record.plan_recorder import Episode, Recorder
-from pycrorm_async.record.plan_types import built_in_declaration
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import Missing
-from pycrorm_async.report.write import Report
-from pycrorm_async.report.write import report as write_report
 from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.bullet import watcher
 from pycrorm_async.writer.plan_writer import DelegatedWriter, WriterState, WriterThread
 
 if TYPE_CHECKING:
+    from sqlalchemy import Select
+
+    from pycrorm_async.events.types import DesignatorTypeDeclared
     from pycrorm_async.export.export import ExportComparison, Exported, FileFormat
     from pycrorm_async.export.lerobot import ImageSize
     from pycrorm_async.export.scenes import Clock as StateClock
     from pycrorm_async.export.selection import Exportable
+    from pycrorm_async.operations import WriterProcess, WriterProcessState
+    from pycrorm_async.plan.task import TaskTreeNode
+    from pycrorm_async.projections import Projection, UserView
+    from pycrorm_async.query import Ask, AskedEpisode, Question, Reading, SyncQuestion
     from pycrorm_async.query.picture import MomentReference
+    from pycrorm_async.recall import Answer, PickUpExperience, Recall
+    from pycrorm_async.record import Episode, Recorder
+    from pycrorm_async.report import Report
+
+
+def _built_in_declaration(dtype: str) -> DesignatorTypeDeclared | None:
+    """Return the declaration of the plan layer's own type with this dtype; other names do not load the plan layer."""
+    is_built_in = any(each.dtype == dtype for each in folding.SCHEMA.leaves)
+    return record.built_in_declaration(dtype) if is_built_in else None
 
 
 # === memory parts =============================================================================================
 
 
-class Parts(NamedTuple):
-    """The parts of an open memory, to which plans are connected in one context or in the whole process."""
+class Parts:
+    """The parts of an open memory, to which plans are connected in one context or in the whole process.
 
-    queue: RecorderQueue
-    writer: WriterThread | DelegatedWriter
-    reading: Reading
-    emitter: Emitter
-    recorder: Recorder
-    recording: Recording
-    experience: PickUpExperience
-    process: WriterProcess | None = None
+    Those that record plans, read or recall are made when they are first used, because a program that records another
+    executive needs none of them.
+    """
+
+    def __init__(
+        self,
+        address: DatabaseAddress,
+        queue: RecorderQueue,
+        writer: WriterThread | DelegatedWriter,
+        recording: Recording,
+        clock: Clock,
+        process: WriterProcess | None = None,
+    ) -> None:
+        self.queue = queue
+        self.writer = writer
+        self.recording = recording
+        self.process = process
+        self.emitter: Final[Emitter] = recording.emitter
+        self.episodes: Final[OpenEpisodes] = recording.episodes
+        self.made_recorder: Recorder | None = None
+        self.made_reading: Reading | None = None
+        self._made_recall: Recall | None = None
+        self._made_experience: PickUpExperience | None = None
+        self._address = address
+        self._clock = clock
+        self._lock = threading.RLock()  # a finalizer may read a part while this thread makes one
+
+    @property
+    def recorder(self) -> Recorder:
+        """The recorder of our own plan layer."""
+        if self.made_recorder is None:
+            with self._lock:
+                if self.made_recorder is None:
+                    self.made_recorder = record.Recorder(self.recording)
+        return self.made_recorder
+
+    @property
+    def reading(self) -> Reading:
+        """The reading side, which opens the database at its first query."""
+        if self.made_reading is None:
+            with self._lock:
+                if self.made_reading is None:
+                    self.made_reading = reading_side.Reading(self._address)
+        return self.made_reading
+
+    @property
+    def recall(self) -> Recall:
+        """The past actions of the database and of this process."""
+        if self._made_recall is None:
+            with self._lock:
+                running = recalling.ProcessCases(
+                    self.emitter,
+                    open_episodes=lambda: [*self.episodes.by_id],
+                    flush=self.flush,
+                    log=self.reading.log,
+                    clock=self._clock,
+                )
+                reader = recalling.CaseReader(recalling.DatabaseSource(self.reading), running)
+                self._made_recall = recalling.Recall(reader, self.reading, self._clock)
+        return self._made_recall
+
+    @property
+    def experience(self) -> PickUpExperience:
+        """The experience that location designators ask."""
+        if self._made_experience is None:
+            with self._lock:
+                if self._made_experience is None:
+                    self._made_experience = recalling.PickUpExperience(self.reading, lambda: self.recall.reader)
+                    self._made_experience.is_closed = self.emitter.is_closed
+        return self._made_experience
 
     async def flush(self) -> None:
         """Wait until all events recorded so far are stored and visible. Raises as `Memory.flush` does."""
         position = self.queue.written
         await self.queue.synced_to(position)
         await self.writer.flush(position)
+
+    def close(self, error: BaseException | None) -> None:
+        """End the open episodes and record nothing more."""
+        recorder = self.made_recorder
+        self.episodes.refuse_new()
+        for episode in self.episodes.all:
+            (recorder.close_episode if recorder is not None else self.episodes.close)(
+                episode, error or asyncio.CancelledError("the memory was closed")
+            )
+        self.disconnect()
+        if recorder is not None:
+            recorder.close()
+
+    def disconnect(self, *because: str) -> None:
+        """Record nothing more, and answer no plan."""
+        self.emitter.close(*because)
+        if self._made_experience is not None:
+            self._made_experience.is_closed = True
+
+    async def close_reading(self) -> None:
+        """Close the connections of the reading side, if it was used."""
+        if self.made_reading is not None:
+            await self.made_reading.close()
 
     @contextmanager
     def in_context(self) -> Iterator[None]:
@@ -128,20 +211,30 @@ class Parts(NamedTuple):
     @contextmanager
     def in_process(self) -> Iterator[None]:
         """Do so for all contexts of this process that have no memory of their own."""
-        for variable, value in self._variables():
+        variables = self._variables()
+        for variable, value in variables:
             variable.connect(value)
         try:
             yield
         finally:
-            for variable, value in self._variables():
+            for variable, value in variables:
                 variable.disconnect(value)
 
     def _variables(self) -> tuple[tuple[ConnectedVar[Any], object], ...]:
+        def late(make: Callable[[], object]) -> Late[object]:
+            return Late(make, lambda: self.emitter.is_closed)
+
+        recorder: object
+        calls: object
+        if "pycrorm_async.plan.execution" in sys.modules:  # plans read what is made already a little faster
+            recorder, calls = self.recorder, self.recorder.calls
+        else:
+            recorder, calls = late(lambda: self.recorder), late(lambda: self.recorder.calls)
         return (
-            (recorder, self.recorder),
-            (watcher, self.recorder),
-            (called_performs, self.recorder.calls),
-            (experience, self.experience),
+            (connected_var.plan_observer, recorder),
+            (connected_var.world_watcher, recorder),
+            (connected_var.called_performs, calls),
+            (connected_var.experience, late(lambda: self.experience)),
         )
 
 
@@ -205,7 +298,7 @@ class MemoryStatus(NamedTuple):
     @classmethod
     def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:
         """Collect the present state of the memory with these parts."""
-        queue, emitter, recorder = parts.queue, parts.emitter, parts.recorder
+        queue, emitter, recorder = parts.queue, parts.emitter, parts.made_recorder
         drain_status = queue.external_drain_status
         return cls(
             written=queue.written,
@@ -217,7 +310,7 @@ class MemoryStatus(NamedTuple):
             faults=emitter.faults,
             unawaited=emitter.unawaited,
             missing=emitter.missing.count,
-            samples_left_out=recorder.samples_left_out,
+            samples_left_out=recorder.samples_left_out if recorder is not None else 0,
             writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(unadopted),
             spool_fault=None if queue.failure is None else str(queue.failure),
@@ -235,14 +328,38 @@ T = TypeVar("T")
 _P = ParamSpec("_P")
 
 
-def _reading(method: Callable[Concatenate[Reading, _P], T]) -> Callable[Concatenate[Memory, _P], T]:
-    """Return a method of `Reading` as one of an open memory."""
+class _Method:
+    """A method that is made when it is first read, because that loads the class it delegates to."""
 
-    @wraps(method)
-    def read(memory: Memory, *arguments: _P.args, **named: _P.kwargs) -> T:
-        return method(memory.reading, *arguments, **named)
+    def __init__(self, make: Callable[[], Callable[..., Any]]) -> None:
+        self._make = make
 
-    return cast("Callable[Concatenate[Memory, _P], T]", read)
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        setattr(owner, self._name, self._make())
+        return getattr(owner if instance is None else instance, self._name)
+
+
+if TYPE_CHECKING:
+
+    def _as_read(method: Callable[Concatenate[Reading, _P], T]) -> Callable[Concatenate[Memory, _P], T]: ...
+
+
+def _reading(find: Callable[[], Callable[Concatenate[Reading, _P], T]]) -> Callable[Concatenate[Memory, _P], T]:
+    """Return the method of `Reading` that `find` returns as one of an open memory."""
+
+    def make() -> Callable[..., T]:
+        method = find()
+
+        @wraps(method)
+        def read(memory: Memory, *arguments: _P.args, **named: _P.kwargs) -> T:
+            return method(memory.reading, *arguments, **named)
+
+        return read
+
+    return cast("Callable[Concatenate[Memory, _P], T]", _Method(make))
 
 
 class Memory:
@@ -258,7 +375,6 @@ class Memory:
     _parts: Parts | None = None
     _forked_parts: Parts | None = None
     _last_status: Callable[[], MemoryStatus] | None = None
-    _recall: Recall | None = None
 
     def __init__(
         self,
@@ -287,7 +403,7 @@ class Memory:
         return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
 
     def _repr_html_(self) -> str:
-        return memory_html(self._address, self._located if self._parts is not None else None)
+        return reading_side.memory_html(self._address, self._located if self._parts is not None else None)
 
     @classmethod
     def open(
@@ -342,7 +458,7 @@ class Memory:
             address,
             spool=Path(spool) if spool is not None else None,
             views=views,
-            projections=validate_projections(projections),
+            projections=folding.validate_projections(projections) if projections else (),
             settings=settings,
             clock=clock,
             plan_source=plan_source,
@@ -435,13 +551,13 @@ class Memory:
         """
         parts = self._open_parts
         added, removed = checked_tags(tags), checked_tags(remove)
-        name = str(episode.id if isinstance(episode, EpisodeSummary) else episode)
-        for each in parts.recorder.episodes.all:
+        name = str(episode.id if isinstance(episode, reading_side.EpisodeSummary) else episode)
+        for each in parts.episodes.all:
             if str(each) == name:
                 each.change_tags(added, removed)
                 return
         await self.flush()
-        await tag_episode(self._located, name, added, removed, clock=self._clock)
+        await operations.tag_episode(self._located, name, added, removed, clock=self._clock)
 
     async def synced(self) -> None:
         """Wait until all events recorded so far survive a power loss.
@@ -468,8 +584,8 @@ class Memory:
             unreported = self._unreported(fault)
             if unreported is not None:
                 raise unreported from fault
-        if parts.reading.is_open:
-            await parts.reading.refresh(maps=False)
+        if parts.made_reading is not None and parts.made_reading.is_open:
+            await parts.made_reading.refresh(maps=False)
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
         """Return the fault less the parked episodes or outdated tables that a flush reported; None if that is all."""
@@ -496,12 +612,12 @@ class Memory:
     @property
     def recent_episodes(self) -> tuple[str, ...]:
         """The ids of the last hundred episodes this memory opened."""
-        return self._open_parts.recorder.episodes.recent
+        return self._open_parts.episodes.recent
 
     @property
     def opened_count(self) -> int:
         """The number of episodes this memory opened."""
-        return self._open_parts.recorder.episodes.opened_count
+        return self._open_parts.episodes.opened_count
 
     def observe(self, name: str, values: object, *, node: TaskTreeNode | None = None) -> None:
         """Record an observation of your own in the open episode: a measurement, a message, an image.
@@ -547,19 +663,22 @@ class Memory:
         """The reading side of this memory: named queries, sessions, data frames."""
         return self._open_parts.reading
 
-    session = _reading(Reading.session)
-    dataframe = _reading(Reading.dataframe)
-    batches = _reading(Reading.batches)
-    query = _reading(Reading.query)
-    mapped = _reading(Reading.mapped)
-    episodes = _reading(Reading.episodes)
-    tree = _reading(Reading.tree)
-    as_of = _reading(Reading.as_of)
-    diff = _reading(Reading.diff)
-    blob = _reading(Reading.blob)
-    number_of = _reading(Reading.number_of)
-    plot_success = _reading(plot_success)
-    samples = _reading(samples)
+    session = _reading(lambda: reading_side.Reading.session)
+    if TYPE_CHECKING:  # a lambda would lose the overloads
+        dataframe = _as_read(Reading.dataframe)
+    else:
+        dataframe = _reading(lambda: reading_side.Reading.dataframe)
+    batches = _reading(lambda: reading_side.Reading.batches)
+    query = _reading(lambda: reading_side.Reading.query)
+    mapped = _reading(lambda: reading_side.Reading.mapped)
+    episodes = _reading(lambda: reading_side.Reading.episodes)
+    tree = _reading(lambda: reading_side.Reading.tree)
+    as_of = _reading(lambda: reading_side.Reading.as_of)
+    diff = _reading(lambda: reading_side.Reading.diff)
+    blob = _reading(lambda: reading_side.Reading.blob)
+    number_of = _reading(lambda: reading_side.Reading.number_of)
+    plot_success = _reading(lambda: reading_side.plot_success)
+    samples = _reading(lambda: reading_side.read_samples)
 
     @property
     def ask(self) -> Ask[Question]:
@@ -569,18 +688,7 @@ class Memory:
     @property
     def recall(self) -> Recall:
         """The past actions most like a cue: `await memory.recall(type=PickUpAction, has={"arm": Arms.LEFT})`."""
-        parts = self._open_parts
-        if self._recall is None:
-            running = ProcessCases(
-                parts.emitter,
-                open_episodes=lambda: [*parts.recorder.episodes.by_id],
-                flush=parts.flush,
-                log=parts.reading.log,
-                clock=self._clock,
-            )
-            reader = CaseReader(DatabaseSource(parts.reading), running)
-            self._recall = Recall(reader, parts.reading, self._clock)
-        return self._recall
+        return self._open_parts.recall
 
     async def report(
         self,
@@ -592,7 +700,7 @@ class Memory:
         last: int | None = None,
     ) -> Report:
         """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
-        return await write_report(self.reading, episode, path, force=force, first=first, last=last)
+        return await reporting.report(self.reading, episode, path, force=force, first=first, last=last)
 
     async def picture(self, /, episode: AskedEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
         """Return the scene of an episode at a moment as PNG, up to the last flush.
@@ -623,7 +731,7 @@ class Memory:
 
         return await export(
             self.reading,
-            what.question if isinstance(what, SyncQuestion) else what,
+            what.question if isinstance(what, reading_side.SyncQuestion) else what,
             path,
             file_format=file_format,
             episodes=episodes,
@@ -675,16 +783,14 @@ class Memory:
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
             # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
-            access, expected = spool.access, expected_log(address, spool)
+            access, expected = spool.access, operations.expected_log(address, spool)
             log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
             try:
                 declared = [declaration_of(each) for each in await log.declarations()]
                 async with log.reading() as connection:
-                    await current_generation(connection)
+                    await folding.current_generation(connection)
             except TablesForeign:  # recording works without tables; those that cannot be rebuilt are left as they are
-                from pycrorm_async.operations.rebuild import rebuild_outdated  # here, because few programs rebuild
-
-                await rebuild_outdated(address, clock=self._clock)
+                await operations.rebuild_outdated(address, clock=self._clock)
             finally:
                 await log.close()
             spool.bind(log.log_id)
@@ -697,59 +803,42 @@ class Memory:
         process = None
         if not by_thread:
             if not by_daemon:
-                async with open_destination(address, spool, clock=self._clock, settings=self._settings):
+                async with operations.open_destination(address, spool, clock=self._clock, settings=self._settings):
                     pass  # makes the tables of a new database, so that it can be queried before the process is ready
-                where = WriterAssignment(address, spool.path.absolute(), queue.name, self._settings)
-                process = WriterProcess(where)
+                where = operations.WriterAssignment(address, spool.path.absolute(), queue.name, self._settings)
+                process = operations.WriterProcess(where)
                 process.start()
             writer = DelegatedWriter(queue, self._settings, process)
         else:
-            open_ = partial(open_destination, address, spool, clock=self._clock, settings=self._settings)
+            open_ = partial(operations.open_destination, address, spool, clock=self._clock, settings=self._settings)
             writer = WriterThread(
                 source=queue,
                 open_destination=partial(open_, views=self._views, projections=self._projections),
-                adopt=lambda: dead_queues(spool, self._unadopted, settings=self._settings),
+                adopt=lambda: operations.dead_queues(spool, self._unadopted, settings=self._settings),
                 settings=self._settings,
                 local=address.is_sqlite,
             )
             await writer.start()
         self._stack.push_async_exit(partial(self._drain, queue, writer))
-        reading = Reading(address)
-        self._stack.push_async_callback(reading.close)
-        if not by_daemon:
-            with suppress(TablesForeign):  # recording works without tables; queries and `flush` raise this again
-                await reading.refresh(maps=False)
         emitter = Emitter(queue, self._settings)
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         episodes = OpenEpisodes(emitter, self._clock)
-        known = KnownTypes(built_in_declaration)
-        stored = LogEpisodes(address, spool, queue, self._unadopted, timeout_s=self._settings.flush_timeout_s)
+        known = KnownTypes(_built_in_declaration)
+        wait_s = self._settings.flush_timeout_s
+        stored = operations.LogEpisodes(address, spool, queue, self._unadopted, timeout_s=wait_s)
         recording = Recording(
             emitter, episodes, known, declared, software=__version__, provenance=provenance, stored_episodes=stored
         )
-        return Parts(
-            queue,
-            writer,
-            reading,
-            emitter,
-            Recorder(recording),
-            recording,
-            PickUpExperience(reading, lambda: self.recall.reader),
-            process,
-        )
+        parts = Parts(address, queue, writer, recording, self._clock, process)
+        self._stack.push_async_callback(parts.close_reading)
+        return parts
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if self._parts is None:  # in a forked child the memory belongs to the parent
             return
-        recorder = self._parts.recorder
-        recorder.episodes.refuse_new()
-        for episode in recorder.episodes.all:
-            recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
-        self._parts.emitter.close()
-        self._parts.experience.is_closed = True
-        recorder.close()
+        self._parts.close(error)
         await self._parts.emitter.feed.close()
         await self._stack.__aexit__(kind, error, traceback)
 
@@ -784,8 +873,7 @@ class Memory:
     def _forked(self) -> None:
         """Disconnect a forked child: the memory belongs to its parent, and plans of the child are not recorded."""
         if (parts := self._parts) is not None:
-            parts.emitter.close("this process was forked from the one that opened the memory: open a memory in it")
-            parts.experience.is_closed = True
+            parts.disconnect("this process was forked from the one that opened the memory: open a memory in it")
             self._parts, self._forked_parts = None, parts
             self._last_status = lambda: MemoryStatus.of(parts, self._unadopted)
 
@@ -797,15 +885,20 @@ ReadableMemory = Memory  # its name in 0.1, for one release
 
 
 def _awaited(
-    method: Callable[Concatenate[Memory, _P], Coroutine[Any, Any, T]],
+    find: Callable[[], Callable[Concatenate[Memory, _P], Coroutine[Any, Any, T]]],
 ) -> Callable[Concatenate[SyncMemory, _P], T]:
-    """Return the method of a memory as one of `SyncMemory`, which waits for its result."""
+    """Return the method of a memory that `find` returns as one of `SyncMemory`, which waits for its result."""
 
-    @wraps(method)
-    def awaited(memory: SyncMemory, *arguments: _P.args, **named: _P.kwargs) -> T:
-        return memory._await(method(memory._memory, *arguments, **named))  # noqa: SLF001  its own class
+    def make() -> Callable[..., T]:
+        method = find()
 
-    return cast("Callable[Concatenate[SyncMemory, _P], T]", awaited)
+        @wraps(method)
+        def awaited(memory: SyncMemory, *arguments: _P.args, **named: _P.kwargs) -> T:
+            return memory._await(method(memory._memory, *arguments, **named))  # noqa: SLF001  its own class
+
+        return awaited
+
+    return cast("Callable[Concatenate[SyncMemory, _P], T]", _Method(make))
 
 
 class SyncMemory:
@@ -908,21 +1001,25 @@ class SyncMemory:
     def ask(self) -> Ask[SyncQuestion]:
         """The named questions: `memory.ask.root_failures(object="milk").frame()`."""
         reading = self._memory.reading
-        return Ask(lambda plan: SyncQuestion(Question(reading, plan), self._await))
+
+        def asked(plan: Any) -> SyncQuestion:
+            return reading_side.SyncQuestion(reading_side.Question(reading, plan), self._await)
+
+        return reading_side.Ask(asked)
 
     def recall(self, type: str | type | None = None, **cue: Any) -> Answer:  # noqa: A002  the feature's name
         """Return the past actions most like a cue; see `Recall.__call__`."""
         return self._await(self._memory.recall(type, **cue))
 
-    synced = _awaited(Memory.synced)
-    episodes = _awaited(Memory.episodes)
-    tree = _awaited(Memory.tree)
-    as_of = _awaited(Memory.as_of)
-    diff = _awaited(Memory.diff)
-    query = _awaited(Memory.query)
-    dataframe = _awaited(Memory.dataframe)
-    report = _awaited(Memory.report)
-    picture = _awaited(Memory.picture)
-    plot_success = _awaited(Memory.plot_success)
-    samples = _awaited(Memory.samples)
-    export = _awaited(Memory.export)
+    synced = _awaited(lambda: Memory.synced)
+    episodes = _awaited(lambda: Memory.episodes)
+    tree = _awaited(lambda: Memory.tree)
+    as_of = _awaited(lambda: Memory.as_of)
+    diff = _awaited(lambda: Memory.diff)
+    query = _awaited(lambda: Memory.query)
+    dataframe = _awaited(lambda: Memory.dataframe)
+    report = _awaited(lambda: Memory.report)
+    picture = _awaited(lambda: Memory.picture)
+    plot_success = _awaited(lambda: Memory.plot_success)
+    samples = _awaited(lambda: Memory.samples)
+    export = _awaited(lambda: Memory.export)

@@ -47,6 +47,7 @@ from types import CoroutineType
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 from weakref import ref
 
+from pycrorm_async import connected_var
 from pycrorm_async.clock import monotonic_ns
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.plan.failures import Resource, ResourceDeadlock, is_plan_failure
@@ -338,7 +339,7 @@ class PlanObserver(Protocol):
         ...
 
 
-recorder: ConnectedVar[PlanObserver] = ConnectedVar("recorder")
+recorder: ConnectedVar[PlanObserver] = connected_var.plan_observer
 
 current_simulation: ContextVar[Simulation | None] = ContextVar("current_simulation", default=None)
 """The innermost simulation of this context; None outside a simulation."""
@@ -431,7 +432,7 @@ def _coroutines_of_tasks() -> set[int]:
         return set()
 
 
-called_performs: ConnectedVar[CalledPerforms] = ConnectedVar("called_performs")
+called_performs: ConnectedVar[CalledPerforms] = connected_var.called_performs
 """The calls of the context's episode, or of its memory outside an episode; None if there is no memory."""
 
 

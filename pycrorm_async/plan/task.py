@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import msgspec
 
+from pycrorm_async import connected_var
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.plan.failures import Resource
 from pycrorm_async.task_status import TaskStatus
@@ -206,7 +207,7 @@ class Experience(Protocol):
         ...
 
 
-experience: ConnectedVar[Experience] = ConnectedVar("experience")
+experience: ConnectedVar[Experience] = connected_var.experience
 
 
 # === task branches ============================================================================================

@@ -11,3 +11,24 @@ projections that users write. Every table here can be dropped and rebuilt from t
 The table `pose` is stored as `zz_pose__1001`, in generation 1001, and `pose` itself is a view. A rebuild fills
 `zz_pose__1002` next to it and then replaces the views. The prefix puts these tables at the end of a list of names.
 """
+
+from typing import TYPE_CHECKING
+
+from pycrorm_async.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from pycrorm_async.projections.columns import SCHEMA as SCHEMA
+    from pycrorm_async.projections.custom import Projection as Projection
+    from pycrorm_async.projections.custom import validate_projections as validate_projections
+    from pycrorm_async.projections.generations import current_generation as current_generation
+    from pycrorm_async.projections.mapped_tables import UserView as UserView
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "custom": "Projection validate_projections",
+        "generations": "current_generation",
+        "mapped_tables": "UserView",
+        "columns": "SCHEMA",
+    },
+)

@@ -125,14 +125,25 @@ class Reading:
     async def refresh(self, *, maps: bool = True) -> None:
         """Learn the designator types that were declared since the last call, and map them unless `maps` is false."""
         await self._ready()
-        declarations = await self._log.declarations()
+        await self._learn(self._log)
+        if maps:  # every session does this first
+            self._classes.map()
+
+    async def _learn(self, log: EventLog) -> None:
+        declarations = await log.declarations()
         if declarations != self._declarations:
-            generation = await _generation(self._log)
+            generation = await _generation(log)
             united = unite(generation.layout, declarations)
             self._classes.learn(united.accepted.values(), united.layout.renamed)
             self._declarations = declarations
-        if maps:  # every session does this first
-            self._classes.map()
+
+    async def _learn_apart(self) -> None:
+        """Learn the types on a connection of its own, in any loop."""
+        log = await EventLog.open(self._address, create=False)
+        try:
+            await self._learn(log)
+        finally:
+            await log.close()
 
     async def present_names(self) -> Mapping[str, str]:
         """Return the present name of each type that was declared, by all the names that it had."""
@@ -265,11 +276,14 @@ class Reading:
     def mapped(self, designator: str | type) -> Any:
         """Return the mapped class of a dtype, a table or a designator class, as of the last `refresh`.
 
-        Raises `CallerError` for a type that was never declared in this memory, and before the first query, which
-        reads the types.
+        Before the first query it reads the types itself. Raises `CallerError` for a type that was never declared in
+        this memory, and once it is closed; `DatabaseUnavailable` if it does not exist yet.
         """
+        if self._is_closed:
+            raise CallerError("this memory is closed: open it again")
         if not self.is_open:
-            raise CallerError("this memory has not read its types yet: open a session first")
+            with ThreadPoolExecutor(1, thread_name_prefix="pycrorm-types") as thread:
+                thread.submit(asyncio.run, self._learn_apart()).result()
         return self._classes.of(designator)
 
     # --- named queries ----------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-async def samples(reading: Reading, /, stream: str, *, episode: AskedEpisode = "last") -> pd.DataFrame:
+async def read_samples(reading: Reading, /, stream: str, *, episode: AskedEpisode = "last") -> pd.DataFrame:
     """Return the samples of a stream of one episode (`RecordedEpisode.sampled`) as a frame of pandas, by time.
 
     >>> frame = await memory.samples("joint_states")

@@ -1,1 +1,18 @@
 """Recall past situations: find the remembered actions most like this one, and count how they ended."""
+
+from typing import TYPE_CHECKING
+
+from pycrorm_async.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from pycrorm_async.recall.answer import Answer as Answer
+    from pycrorm_async.recall.experience import PickUpExperience as PickUpExperience
+    from pycrorm_async.recall.recall import CaseReader as CaseReader
+    from pycrorm_async.recall.recall import DatabaseSource as DatabaseSource
+    from pycrorm_async.recall.recall import ProcessCases as ProcessCases
+    from pycrorm_async.recall.recall import Recall as Recall
+
+__getattr__ = lazy_names(
+    __name__,
+    {"answer": "Answer", "experience": "PickUpExperience", "recall": "CaseReader DatabaseSource ProcessCases Recall"},
+)

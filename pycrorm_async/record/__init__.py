@@ -12,3 +12,14 @@ designators, and a world that reports its changes in the plan's own thread, so t
 The other modules know neither a plan nor a world: a class of poses, objects or failures says so by an attribute
 (`__recorded_as__`, `__is_plan_failure__`).
 """
+
+from typing import TYPE_CHECKING
+
+from pycrorm_async.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from pycrorm_async.record.plan_recorder import Episode as Episode
+    from pycrorm_async.record.plan_recorder import Recorder as Recorder
+    from pycrorm_async.record.plan_types import built_in_declaration as built_in_declaration
+
+__getattr__ = lazy_names(__name__, {"plan_recorder": "Episode Recorder", "plan_types": "built_in_declaration"})

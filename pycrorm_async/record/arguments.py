@@ -15,7 +15,7 @@ from pycrorm_async.events import types as event_types
 from pycrorm_async.events.reasons import UNNAMED
 from pycrorm_async.record import values
 from pycrorm_async.record.declarations import DeclaredType
-from pycrorm_async.record.geometry import mass_of, urdf_of
+from pycrorm_async.record.episode_writer import Emitter
 from pycrorm_async.record.objects import RecordedObject, RecordedObjects
 
 Convert: TypeAlias = Callable[[Any], Any]
@@ -81,8 +81,9 @@ def _are_plain(joints: dict[Any, Any]) -> bool:
 class ArgumentReader:
     """Copies the arguments that describe an object; counts the ones that it has to leave out in `missing`."""
 
-    def __init__(self, missing: values.MissingValues) -> None:
-        self._missing = missing
+    def __init__(self, emitter: Emitter) -> None:
+        self._emitter = emitter
+        self._missing = emitter.missing
 
     def object_of(
         self,
@@ -93,10 +94,12 @@ class ArgumentReader:
         **others: Any,
     ) -> RecordedObject:
         """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
-        urdf, kind = urdf_of(name, others["urdf"], self._missing), self.text_of("object_type", object_type) or "UNKNOWN"
+        kind, urdf = self.text_of("object_type", object_type) or "UNKNOWN", None
         mass_kg = self._number_of("mass_kg", others["mass_kg"])
-        if mass_kg is None:
-            mass_kg = mass_of(urdf, kind)
+        if others["urdf"] is not None:
+            urdf = self._emitter.descriptions.urdf_of(name, others["urdf"])
+        if mass_kg is None and urdf is not None:
+            mass_kg = self._emitter.descriptions.mass_of(urdf, kind)
         texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
         return RecordedObject(
             self.text_of("name", name) or "an object",

@@ -17,7 +17,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol, cast
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -46,7 +47,6 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.record.declarations import Declared, DeclaredType
 from pycrorm_async.record.event_feed import EventFeed
-from pycrorm_async.record.geometry import Descriptions
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, end_statuses, episode_started
 from pycrorm_async.record.recorded_before import RecordedBefore
 from pycrorm_async.record.values import (
@@ -60,6 +60,9 @@ from pycrorm_async.record.values import (
     missing_in,
     missing_value,
 )
+
+if TYPE_CHECKING:
+    from pycrorm_async.record.geometry import Descriptions
 from pycrorm_async.settings import Settings
 
 _LAST_ENDS_S = 1.0
@@ -354,7 +357,6 @@ class Emitter:
         unrecorded: the number of nodes, episodes and other reports that came after it was closed.
         feed: the observers of this memory, to which recorded events are published.
         missing: counts the values that could not be recorded.
-        descriptions: declares the descriptions of objects.
         unawaited: for each designator type whose perform was called and never awaited, a sentence for the user.
     """
 
@@ -366,10 +368,16 @@ class Emitter:
         self.unrecorded = 0
         self.feed = EventFeed()
         self.missing = MissingValues()
-        self.descriptions = Descriptions(self, settings, self.missing)
         self.unawaited: tuple[str, ...] = ()
         self._fault_count = 0
         self._last_fault: str | None = None
+
+    @cached_property
+    def descriptions(self) -> Descriptions:
+        """Declares the descriptions of objects; the first one loads the modules of the world that read URDFs."""
+        from pycrorm_async.record.geometry import Descriptions
+
+        return Descriptions(self, self.settings, self.missing)
 
     @property
     def faults(self) -> Faults:

@@ -64,7 +64,7 @@ class Described(Protocol):
         ...
 
 
-class ReadDescription:
+class _ReadDescription:
     """A description that no world has loaded; the boxes around its shapes are computed from their files."""
 
     def __init__(self, text: str) -> None:
@@ -79,31 +79,6 @@ class ReadDescription:
 
     def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
         return model_boxes.shape_boxes(self.description_text, visual=True, links=links)
-
-
-def urdf_of(name: str, urdf: Any, missing: MissingValues) -> str | None:
-    """Return the text of a URDF with the paths of its meshes, as a world reads it; faults are counted as missing.
-
-    The text is kept where a world would refuse it, because an executive may have loaded it elsewhere.
-    """
-    text = urdf if isinstance(urdf, str) and urdf.lstrip().startswith("<") else None
-    if urdf is None or (text is not None and "<mesh" not in text):
-        return text
-    try:
-        return urdf_text(name, text or Path(urdf))
-    except (DescriptionNotLoadable, TypeError) as error:
-        if text is None:  # declaring a text counts the mesh that does not exist, or the fault of the XML
-            missing.note("ObjectAdded", "urdf", f"{clean_repr(urdf)}: {message_of(error)}")
-        return text
-
-
-def mass_of(urdf: str | None, object_type: str) -> float | None:
-    """Return the mass of a described object, as `Object.mass_kg`; None for a robot or an environment."""
-    return (
-        model_boxes.described_mass_kg(urdf)
-        if urdf is not None and object_type not in ("ROBOT", "ENVIRONMENT")
-        else None
-    )
 
 
 class _DeclaredDescription(NamedTuple):
@@ -145,6 +120,29 @@ class Descriptions:
         except Exception as error:  # noqa: BLE001  a setter of the world must not fail because of a memory
             self._missing.note("ObjectAdded", "description", _reason(error))
             return None
+
+    def declare_text(self, urdf: str) -> str | None:
+        """Declare a description that no world has loaded, as `declare` does."""
+        return self.declare(_ReadDescription(urdf))
+
+    def urdf_of(self, name: str, urdf: Any) -> str | None:
+        """Return the text of a URDF with the paths of its meshes, as a world reads it; faults are counted as missing.
+
+        The text is kept where a world would refuse it, because an executive may have loaded it elsewhere.
+        """
+        text = urdf if isinstance(urdf, str) and urdf.lstrip().startswith("<") else None
+        if text is not None and "<mesh" not in text:
+            return text
+        try:
+            return urdf_text(name, text or Path(urdf))
+        except (DescriptionNotLoadable, TypeError) as error:
+            if text is None:  # declaring a text counts the mesh that does not exist, or the fault of the XML
+                self._missing.note("ObjectAdded", "urdf", f"{clean_repr(urdf)}: {message_of(error)}")
+            return text
+
+    def mass_of(self, urdf: str, object_type: str) -> float | None:
+        """Return the mass of a described object, as `Object.mass_kg`; None for a robot or an environment."""
+        return model_boxes.described_mass_kg(urdf) if object_type not in ("ROBOT", "ENVIRONMENT") else None
 
     def _declare(self, described: Described) -> str:
         text = described.description_text

@@ -21,7 +21,6 @@ from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import NotEncodable, encoded
 from pycrorm_async.record.episode_writer import ActingRobot, EpisodeWriter
 from pycrorm_async.record.frames import Frames
-from pycrorm_async.record.geometry import ReadDescription
 from pycrorm_async.record.values import PoseLike, recorded_as
 
 K = TypeVar("K", bound=Hashable)
@@ -180,7 +179,7 @@ class RecordedObjects(ObjectRows[Hashable]):
                 event_types.BriefPose.of(added.pose),
                 dict(added.joints),
                 node,
-                self._emitter.descriptions.declare(ReadDescription(added.urdf)) if added.urdf is not None else None,
+                self._emitter.descriptions.declare_text(added.urdf) if added.urdf is not None else None,
                 added.color,
                 added.model,
                 added.serial,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from os import PathLike
 from types import TracebackType
-from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar, get_args
 
 from msgspec.structs import replace
 
@@ -33,13 +33,15 @@ from pycrorm_async.record.event_times import At, EventTimes
 from pycrorm_async.record.objects import RecordedObjects
 from pycrorm_async.record.opening import EpisodeOpening, Failures, end_statuses
 from pycrorm_async.record.recorded_before import RecordedBefore, StoredEpisode, StoredEpisodes
-from pycrorm_async.record.samples import SampleBlocks, sampled_values
 from pycrorm_async.record.values import (
     PoseLike,
     clean_repr,
     encode_or_missing,
     message_of,
 )
+
+if TYPE_CHECKING:
+    from pycrorm_async.record.samples import SampleBlocks
 
 # === ordered calls ============================================================================================
 #
@@ -221,8 +223,8 @@ class RecordedEpisode(EpisodeWriter):
         self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
         self._objects = RecordedObjects(self)
         self._values = RecordedValues(convert, self._objects)
-        self._arguments = ArgumentReader(emitter.missing)
-        self._samples = SampleBlocks()
+        self._arguments = ArgumentReader(emitter)
+        self._samples: SampleBlocks | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -625,12 +627,16 @@ class RecordedEpisode(EpisodeWriter):
         """
         name = name_of(key)
         stamps = self._now_ns() if at is None else at
-        names, numbers, times = sampled_values(channels, values, stamps)
+        from pycrorm_async.record import samples  # here, because it loads numpy and few executives have streams
+
+        names, numbers, times = samples.sampled_values(channels, values, stamps)
 
         def write() -> None:
             last = int(times[-1]) if len(times) else 0
             if self.time is not None and last > self.time[0]:  # streams overlap, so that others may be ahead
                 self._set_time("Observed", last)
+            if self._samples is None:
+                self._samples = samples.SampleBlocks()
             for sampling, block in self._samples.add(name, names, numbers, times, node):
                 self._put_block(name, sampling, block)
 
@@ -729,7 +735,7 @@ class RecordedEpisode(EpisodeWriter):
             return
         if not self.closed:
             self._set_time("EpisodeEnded", self._end_at)
-            for name, node, block in self._samples.take_all():
+            for name, node, block in self._samples.take_all() if self._samples is not None else ():
                 self._put_block(name, node, block)
         if (left := len(self._nodes)) and failure is None and not self.closed and self._end_status != "UNKNOWN":
             self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {left}")

@@ -18,6 +18,7 @@ import json
 import logging
 import math
 import operator
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
@@ -28,8 +29,6 @@ from reprlib import Repr
 from types import NoneType
 from typing import Any, ClassVar, Final, NamedTuple, Protocol, TypeAlias, cast
 from weakref import ReferenceType, ref
-
-import numpy as np
 
 from pycrorm_async.events.codec import clean as clean
 from pycrorm_async.events.codec import unwritable
@@ -235,8 +234,14 @@ def _encode_text(value: Any, _enum: type[Enum] | None, _references: References) 
     return str.__str__(_require_writable(str.__str__(value)))
 
 
+def _is_numpy(value: object, kind: str) -> bool:
+    """Return whether a value is of this class of numpy. Numpy is not imported for it: who has such a value did so."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(value, getattr(numpy, kind, ()))
+
+
 def _encode_boolean(value: Any, _enum: type[Enum] | None, _references: References) -> bool:
-    if not isinstance(value, bool | np.bool_):
+    if not (isinstance(value, bool) or _is_numpy(value, "bool_")):
         raise _mismatch("bool", value)
     return bool(value)
 
@@ -305,7 +310,7 @@ def _type_name(value: Any) -> str | None:
 
 
 def _encode_list(encode: Encoder, value: Any, enum: type[Enum] | None, references: References) -> list[Any]:
-    if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
+    if isinstance(value, str | bytes) or not (isinstance(value, Sequence) or _is_numpy(value, "ndarray")):
         raise _mismatch("list", value)
     return [encode(each, enum, references) if each is not None else None for each in _limit_items(value, value)]
 
@@ -366,7 +371,7 @@ def _limit_items(holder: Any, items: Iterable[Any]) -> Iterable[Any]:
     return items if type(holder) in _BUILT_IN_CONTAINERS else _stop_at_limit(items)
 
 
-_BUILT_IN_CONTAINERS = (list, tuple, dict, np.ndarray)
+_BUILT_IN_CONTAINERS = (list, tuple, dict)
 """Types whose `len` bounds their iteration; a user's own class may yield items without end."""
 
 
@@ -473,11 +478,11 @@ class ValueReader:
             return _require_writable(value.name)
         if isinstance(value, str | int | float):
             return _require_writable(_as_built_in(value))
-        if isinstance(value, np.generic):
+        if _is_numpy(value, "generic"):
             return self.read(value.item(), path, depth + 1)
         if isinstance(value, Blob):
             return self._blob(value)
-        if isinstance(value, np.ndarray):
+        if _is_numpy(value, "ndarray"):
             return self._array(value, path, depth)
         if recorded_as(kind) == "pose" or isinstance(value, PoseValue):
             return _encode_pose(value, None, self._references)
@@ -491,11 +496,12 @@ class ValueReader:
             return self._items(value, path, depth)
         raise _mismatch("JSON", value)
 
-    def _array(self, value: np.ndarray[Any, Any], path: str, depth: int) -> Any:
+    def _array(self, value: Any, path: str, depth: int) -> Any:
         if self._put_blob is None or (value.dtype.kind in _NUMBERS and value.size <= ARRAY_ITEMS_MAX):
             return self.read(value.tolist(), path, depth)
         file = io.BytesIO()
-        np.save(file, value, allow_pickle=False)  # raises for an array of objects, or a user's own dtype
+        save = sys.modules["numpy"].save
+        save(file, value, allow_pickle=False)  # raises for an array of objects, or a user's own dtype
         reference = self._put(file.getvalue(), NPY)
         return BlobReference(reference.hash, NPY, reference.size, str(value.dtype), value.shape)
 

@@ -137,6 +137,8 @@ class Dialect(ABC):
     def definition(self, table: Table, *, if_missing: bool = False) -> list[str]:
         """Return the statements that create a table of the log, with its indexes and triggers."""
         indexes = sorted(table.indexes, key=lambda each: str(each.name))
+        for partial in (each for each in indexes if schema.WHERE in each.info):
+            partial.dialect_kwargs[f"{self.syntax.name}_where"] = partial.info[schema.WHERE]
         creations = [
             self.creation(table, if_missing=if_missing),
             *(str(self.compile(CreateIndex(each))) for each in indexes),

@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import sqlalchemy as sql
 from sqlalchemy import bindparam, func, select
-from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.base import SyntaxExtension
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
@@ -25,6 +25,8 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 # === tables ===================================================================================================
 
 METADATA: Final = sql.MetaData()
+WHERE: Final = "where"
+"""The entry of an index's `info` with the condition of a partial one. An option of both dialects would load both."""
 _Long: Final = sql.BigInteger().with_variant(sql.Integer(), "sqlite")
 """The type of times and counts; a STRICT table of SQLite has one name for integers."""
 
@@ -79,8 +81,8 @@ _IS_STOPPED: Final = sql.or_(EPISODE.c.refused.is_not(None), EPISODE.c.parked.is
 
 # Each append and each fold changes whether an episode is in this index, so no update on PostgreSQL is heap-only,
 # whatever space its page has. In return a poll costs the same with any number of episodes.
-sql.Index("episode_behind", EPISODE.c.number, sqlite_where=_IS_BEHIND, postgresql_where=_IS_BEHIND)
-sql.Index("episode_stopped", EPISODE.c.number, sqlite_where=_IS_STOPPED, postgresql_where=_IS_STOPPED)
+sql.Index("episode_behind", EPISODE.c.number, info={WHERE: _IS_BEHIND})
+sql.Index("episode_stopped", EPISODE.c.number, info={WHERE: _IS_STOPPED})
 
 # `Integer` holds both parts of the key (`events.ids`), on PostgreSQL in half the bytes of a bigint, which the logs of
 # 0.1.0 have and which reads alike. The payload is text, which keeps the bytes of the queue: jsonb refuses U+0000,
@@ -167,13 +169,36 @@ def _is_among(column: sql.Column[Any], name: str) -> _IsAmong:
     return _IsAmong(column, select(_batch(name, value=column.type)).scalar_subquery())
 
 
-def _insert_batch(table: sql.Table, batch: sql.Subquery) -> Any:
+class _OnConflict(SyntaxExtension, sql.ClauseElement):
+    """ON CONFLICT of a key, the same on both databases; the inserts of a dialect would load it for the other one too.
+
+    Args:
+        updated: columns that take the values of the refused row; without any the row is dropped.
+    """
+
+    inherit_cache = False  # each statement is compiled once
+
+    def __init__(self, *key: str, updated: Sequence[str] = ()) -> None:
+        self.key = key
+        self.updated = updated
+
+    def apply_to_insert(self, insert_stmt: sql.Insert) -> None:
+        insert_stmt.apply_syntax_extension_point(self.append_replacing_same_type, "post_values")
+
+
+@compiles(_OnConflict)
+def _on_conflict(element: _OnConflict, _compiler: object, **_: object) -> str:
+    updates = ", ".join(f"{each} = excluded.{each}" for each in element.updated)
+    return f"ON CONFLICT ({', '.join(element.key)}) DO {f'UPDATE SET {updates}' if updates else 'NOTHING'}"
+
+
+def _insert_batch(table: sql.Table, batch: sql.Subquery) -> sql.Insert:
     # Without WHERE, SQLite would take ON CONFLICT for the ON of a join.
-    return insert(table).from_select(list(batch.c.keys()), select(batch).where(sql.true()))
+    return sql.insert(table).from_select(list(batch.c.keys()), select(batch).where(sql.true()))
 
 
-def _insert_one(table: sql.Table, columns: Sequence[sql.Column[Any]]) -> Any:
-    return insert(table).values({each.name: bindparam(each.name) for each in columns}).inline()
+def _insert_one(table: sql.Table, columns: Sequence[sql.Column[Any]]) -> sql.Insert:
+    return sql.insert(table).values({each.name: bindparam(each.name) for each in columns}).inline()
 
 
 class _Bytes(FunctionElement[bytes]):
@@ -220,7 +245,7 @@ _is_named = _is_among(DECLARATION.c.fingerprint, "fingerprints")
 SELECT_DECLARED: Final = select(DECLARATION.c.fingerprint).where(_is_named)
 SELECT_DESCRIPTIONS: Final = select(_Bytes(DECLARATION.c.payload)).where(_is_named)
 _named = _batch("named", fingerprint=sql.Text, payload=sql.Text)
-INSERT_DECLARATIONS: Final = _insert_batch(DECLARATION, _named).on_conflict_do_nothing(index_elements=["fingerprint"])
+INSERT_DECLARATIONS: Final = _insert_batch(DECLARATION, _named).ext(_OnConflict("fingerprint"))
 
 
 def select_declarations(condition: str) -> sql.Select[Any]:
@@ -264,10 +289,8 @@ SELECT_NUMBER_MAX: Final = select(func.coalesce(func.max(EPISODE.c.number), sql.
 _rows = _batch(
     "rows", number=_Long, id=sql.Text, head=_Long, started_wall_ns=_Long, ended_wall_ns=_Long, refused=sql.Text
 )
-_inserted = _insert_batch(EPISODE, _rows)
-UPSERT_EPISODES: Final = _inserted.on_conflict_do_update(
-    index_elements=["number"],
-    set_={name: _inserted.excluded[name] for name in ("head", "ended_wall_ns", "refused")},
+UPSERT_EPISODES: Final = _insert_batch(EPISODE, _rows).ext(
+    _OnConflict("number", updated=("head", "ended_wall_ns", "refused"))
 )
 _steps = _batch("steps", number=_Long, before=_Long, folded=_Long)
 # Locked by number, as elsewhere: an UPDATE alone locks in any order, and two folds of the same episodes could deadlock.
@@ -308,7 +331,7 @@ INSERT_INCARNATION: Final = _insert_one(INCARNATION, list(INCARNATION.c)[1:])
 SELECT_INCARNATIONS: Final = select(*list(INCARNATION.c)[1:]).order_by(INCARNATION.c.number)
 
 _digests = _batch("digests", episode=sql.Integer, sequence=sql.Integer, digest=sql.Text)
-INSERT_DIGESTS: Final = _insert_batch(DIGEST, _digests).on_conflict_do_nothing(index_elements=["episode", "sequence"])
+INSERT_DIGESTS: Final = _insert_batch(DIGEST, _digests).ext(_OnConflict("episode", "sequence"))
 SELECT_DIGEST: Final = select(DIGEST.c.digest).where(
     DIGEST.c.episode == bindparam("number"), DIGEST.c.sequence == bindparam("sequence")
 )
@@ -325,7 +348,7 @@ SELECT_LAST_DIGESTS: Final = (
     .where(_of_range)
 )
 
-INSERT_BLOB: Final = _insert_one(BLOB, list(BLOB.c)).on_conflict_do_nothing(index_elements=["hash", "part"])
+INSERT_BLOB: Final = _insert_one(BLOB, list(BLOB.c)).ext(_OnConflict("hash", "part"))
 SELECT_COMPLETE_BLOBS: Final = select(BLOB.c.hash).where(
     _is_among(BLOB.c.hash, "hashes"), BLOB.c.part == BLOB.c.parts - sql.literal_column("1")
 )

@@ -23,6 +23,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 
+from pycrorm_async import connected_var
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world.body import Body, ObjectState, WorldState, check_state, inner_points, set_state
 from pycrorm_async.world.bounding_boxes import BoundingBox
@@ -913,4 +914,4 @@ class WorldWatcher(Protocol):
 
 
 current_world: ConnectedVar[BulletWorld] = ConnectedVar("current_world")
-watcher: ConnectedVar[WorldWatcher] = ConnectedVar("watcher")
+watcher: ConnectedVar[WorldWatcher] = connected_var.world_watcher
