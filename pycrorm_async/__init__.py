@@ -20,7 +20,8 @@ from pycrorm_async.moved_modules import keep_former_paths
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
     from pycrorm_async.events.types import Blob
-    from pycrorm_async.memory import Memory, MemoryStatus
+    from pycrorm_async.memory import Memory
+    from pycrorm_async.memory_parts import MemoryStatus
     from pycrorm_async.operations.recovery import recover
     from pycrorm_async.projections.custom import EpisodeProjection, Projection
     from pycrorm_async.projections.mapped_tables import UserView
@@ -54,7 +55,8 @@ __getattr__ = lazy_names(
     {
         "errors": "PycrormError",
         "events.types": "Blob",
-        "memory": "Memory MemoryStatus",
+        "memory": "Memory",
+        "memory_parts": "MemoryStatus",
         "operations.recovery": "recover",
         "projections.custom": "EpisodeProjection Projection",
         "projections.mapped_tables": "UserView",

@@ -20,46 +20,6 @@ from pycrorm_async.orm import rows as row_classes
 from pycrorm_async.orm.episodes import Pose
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
-__all__ = [
-    "NavigateAction",
-    "ParkArmsAction",
-    "MoveTorsoAction",
-    "SetGripperAction",
-    "ReleaseAction",
-    "GripAction",
-    "PickUpAction",
-    "PlaceAction",
-    "TransportAction",
-    "LookAtAction",
-    "DetectAction",
-    "OpenAction",
-    "CloseAction",
-    "GraspingAction",
-    "FaceAtAction",
-    "MoveAndPickUpAction",
-    "BatchRolloutAction",
-    "LearnPolicyAction",
-    "MoveMotion",
-    "MoveTCPMotion",
-    "LookingMotion",
-    "MoveGripperMotion",
-    "MoveArmJointsMotion",
-    "MoveJointsMotion",
-    "DetectingMotion",
-    "OpeningMotion",
-    "ClosingMotion",
-    "WorldStateDetectingMotion",
-    "AccessingMotion",
-    "Sequential",
-    "TryInOrder",
-    "Parallel",
-    "TryAll",
-    "Repeat",
-    "Monitor",
-    "Code",
-    "Retry",
-]
-
 
 class NavigateAction(row_classes.TargetLocationParameter, row_classes.Action):
     """Drive to a place."""

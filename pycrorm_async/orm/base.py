@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from enum import Enum
+from importlib import import_module
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, dataclass_transform
 
@@ -277,8 +278,18 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
             return None
 
 
+def map_leaves() -> None:
+    """Map the classes of single types, unless they are mapped.
+
+    They are configured at once, because a cached statement would meet the new mappers unconfigured.
+    """
+    import_module("pycrorm_async.orm.actions")
+    Base.registry.configure()
+
+
 def view_mappers() -> dict[str, Mapper[Any]]:
     """Return the mappers of this process by view; of the classes that share a view, that of their base."""
+    map_leaves()
     own = [
         each
         for each in Base.registry.mappers

@@ -29,7 +29,7 @@ from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
-from pycrorm_async.orm.base import EPISODE, Base, Moment, inherited_from, known_classes, one_of
+from pycrorm_async.orm.base import EPISODE, Base, Moment, inherited_from, known_classes, map_leaves, one_of
 from pycrorm_async.orm.episodes import Pose
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion, Object
 
@@ -164,6 +164,7 @@ class DynamicClasses:
 
     def _shared(self, dtype: str) -> type[Designator] | None:
         """Return the class that all memories of this process share, by the type's name or one of its tables."""
+        map_leaves()
         declarations = self._declared.get(dtype, [])
         wanted = {dtype, *(each.table for each in declarations)}
         for mapper in Designator.__mapper__.self_and_descendants:

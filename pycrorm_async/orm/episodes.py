@@ -11,16 +11,6 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 from pycrorm_async.orm.base import COMPUTED, ON_REQUEST, Base, JsonText, RowOfEvent, one_of
 from pycrorm_async.world.pose import ObjectType
 
-__all__ = [
-    "ProcessMetaData",
-    "EpisodeTag",
-    "EpisodeRobot",
-    "Position",
-    "Quaternion",
-    "Pose",
-    "RobotState",
-]
-
 
 class ProcessMetaData(Base):
     """An episode with its user, plan, software and outcome. `id` is the episode's number in this database.

@@ -38,34 +38,6 @@ from pycrorm_async.orm.episodes import Pose, ProcessMetaData, RobotState
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
-__all__ = [
-    "Concept",
-    "ConceptAncestor",
-    "ObjectConcept",
-    "Object",
-    "ObjectDescription",
-    "ObjectPart",
-    "BelieveObject",
-    "LocatedObject",
-    "ObjectRemoval",
-    "Attachment",
-    "JointChange",
-    "TaskTreeNode",
-    "LocationResolution",
-    "LocationCandidate",
-    "LocationRefusal",
-    "Detection",
-    "StateSample",
-    "Observation",
-    "ObservationValue",
-    "DesignatorType",
-    "Designator",
-    "ParameterItem",
-    "Action",
-    "Motion",
-    "Language",
-]
-
 # === objects ==================================================================================================
 #
 # Map objects at each moment of their history, their descriptions, removals, attachments, joint changes, and concepts.
@@ -390,6 +362,7 @@ class ClassOfRow(TypeDecorator[str]):
     cache_ok = True
 
     def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[str | None], str | None]:  # noqa: ARG002
+        orm_base.map_leaves()  # before the first row of a designator, whose class may be one of them
         identity, mapped = orm_base.known_classes(dialect).identity, Designator.__mapper__.polymorphic_map
         return lambda lineage: None if lineage is None else identity(lineage, mapped)
 

@@ -13,12 +13,6 @@ from pycrorm_async.orm.rows import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
-__all__ = [
-    "PickUpWithContextView",
-    "RootFailure",
-    "SpatialRelation",
-]
-
 
 class PickUpWithContextView(RowOfEvent, Base):
     """Every pick-up with the poses of robot and object: the sample that the thesis learns from (section 5.2).

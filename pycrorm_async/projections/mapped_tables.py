@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 def mapped_leaves() -> list[LeafTable]:
     """Return the tables of all classes below `Designator` that every memory of this process shares."""
-    orm = sys.modules.get("pycrorm_async.orm")
-    declared = [] if orm is None else [each for each in leaves_of(orm.Designator) if each.dtype is None]
+    rows = sys.modules.get("pycrorm_async.orm.rows")
+    declared = [] if rows is None else [each for each in leaves_of(rows.Designator) if each.dtype is None]
     return [*SCHEMA.leaves, *declared]
 
 

@@ -18,6 +18,7 @@ import json, sys
 def loaded(*packages):
     # The paths of modules that have moved are entries of `sys.modules`, too; they are no modules of files.
     files = [name for name, each in sys.modules.items() if getattr(each, "__spec__", None)]
+    files = [each for each in files if each != "pycrorm_async.world.pose"]  # poses and enums, without numpy
     return sorted(each for each in files if each.startswith(tuple(f"{package}." for package in packages)) or
                   each in packages and not each.startswith("pycrorm_async"))
 
