@@ -6,14 +6,24 @@ Panel: Look at episodes, 2.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, TypeAlias
 
 import typer
 from rich.text import Text
 from rich.tree import Tree
 
-from pycrorm_async.cli.output import EpisodeArgument, JsonOption, moment, print_facts, print_json, print_table, stdout
+from pycrorm_async.cli.output import (
+    EpisodeArgument,
+    JsonOption,
+    moment,
+    note,
+    print_facts,
+    print_json,
+    print_table,
+    stdout,
+)
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import BLOB_KEY
@@ -274,6 +284,8 @@ def _joints_text(each: ObjectThen, *, full: bool) -> str:
 #
 # Draw a recorded task tree with types, statuses, durations and failures.
 
+_DRAWN_MAX = 1_000
+"""Bounds the nodes that are drawn with colours and wrapped lines: each takes 0.5 ms, a plain line a tenth of that."""
 _MESSAGE_MAX = 100
 """Bounds the characters of a failure's message, so that a failed node takes few lines."""
 _SIMULATIONS_MAX = 10
@@ -286,8 +298,15 @@ def print_tree(nodes: Sequence[named_queries.NodeSummary], *, events: bool = Fal
     """Print the nodes of one episode as a tree; `nodes` lists each parent before its children.
 
     With `events` each line has the events of the node's start and end. Long texts are cut and end in an ellipsis,
-    unless `full` is True.
+    unless `full` is True. Many nodes are printed as plain lines.
     """
+    if len(nodes) > _DRAWN_MAX:
+        lines = plain_lines(nodes, events=events, full=full, ascii_only=stdout.options.ascii_only)
+        sys.stdout.writelines(f"{line}\n" for line in lines)
+        note(
+            f"{len(nodes):,} nodes, more than {_DRAWN_MAX:,}: no colours, no line breaks (`pycrorm report` draws them)"
+        )
+        return
     root = tree_of(nodes, events=events, full=full)
     if root is not None:
         stdout.print(root)
@@ -312,27 +331,53 @@ def tree_of(
 
 
 def _line(node: named_queries.NodeSummary, *, events: bool, full: bool) -> Text:
-    line = Text(visible(node.dtype or node.kind))
+    return Text.assemble(*_parts(node, events=events, full=full))
+
+
+def _parts(node: named_queries.NodeSummary, *, events: bool, full: bool) -> Iterator[tuple[str, str]]:
+    """Yield the texts of a node's line, each with its style."""
+    yield visible(node.dtype or node.kind), ""
     if node.parameters:
-        line.append(f"  {visible(parameters_text(node.parameters, full=full, exact=full))}", style="dim")
-    line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))
-    line.append(f"  {duration(node.duration_ns)}", style="dim")
+        yield f"  {visible(parameters_text(node.parameters, full=full, exact=full))}", "dim"
+    yield f"  {node.status}", _STYLES.get(node.status, "red")
+    yield f"  {duration(node.duration_ns)}", "dim"
     if events:
         end = f"e{node.end_sequence}" if node.end_sequence is not None else ""
-        line.append(f"  e{node.sequence}-{end}", style="dim")
+        yield f"  e{node.sequence}-{end}", "dim"
     if node.observations:
-        line.append(f"  {node.observations} observation{'s' * (node.observations > 1)}", style="dim")
+        yield f"  {node.observations} observation{'s' * (node.observations > 1)}", "dim"
     if counts := named_queries.counts_text(node):
-        line.append(f"  {counts}", style="dim")
+        yield f"  {counts}", "dim"
     if node.reason:
         message = one_line(node.failure_message or "", None if full else _MESSAGE_MAX)
-        line.append(visible(f"  {node.reason}{': ' if message else ''}{message}"), style="red")
+        yield visible(f"  {node.reason}{': ' if message else ''}{message}"), "red"
     if node.thoughts:
         listed = node.thoughts if full else node.thoughts[:_SIMULATIONS_MAX]
         numbers = ", ".join(map(str, listed))
         more = f" and {len(node.thoughts) - len(listed)} more" if len(node.thoughts) > len(listed) else ""
-        line.append(f"  simulated in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", style="magenta")
-    return line
+        yield f"  simulated in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", "magenta"
+
+
+def plain_lines(
+    nodes: Sequence[named_queries.NodeSummary], *, events: bool = False, full: bool = False, ascii_only: bool = False
+) -> Iterator[str]:
+    """Yield a line for each node of a tree, without colours and however long."""
+    blank, continued, fork, end = Tree.ASCII_GUIDES if ascii_only else Tree.TREE_GUIDES[0]
+    has_later_sibling: list[bool] = []
+    followed: list[bool] = []
+    """Whether each node has a later sibling, the last node first."""
+    for node in reversed(nodes):
+        del has_later_sibling[node.depth + 1 :]
+        has_later_sibling += [False] * (node.depth + 1 - len(has_later_sibling))
+        followed.append(has_later_sibling[node.depth])
+        has_later_sibling[node.depth] = True
+    bars: list[str] = []
+    for node, is_followed in zip(nodes, reversed(followed), strict=True):
+        del bars[max(node.depth - 1, 0) :]
+        before = "".join(bars) + (fork if is_followed else end) if node.depth else ""
+        yield before + "".join(text for text, _ in _parts(node, events=events, full=full))
+        if node.depth:
+            bars.append(continued if is_followed else blank)
 
 
 def simulated_by(episode: named_queries.EpisodeSummary) -> str:
