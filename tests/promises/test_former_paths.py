@@ -41,4 +41,4 @@ def test_importing_the_package_imports_none_of_its_parts() -> None:
         "print(sorted(each for each in imported if each.startswith('pycrorm_async')))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "['pycrorm_async', 'pycrorm_async.moved_modules']\n"
+    assert done.stdout == "['pycrorm_async', 'pycrorm_async.lazy_names', 'pycrorm_async.moved_modules']\n"
