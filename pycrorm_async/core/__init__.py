@@ -1,8 +1,9 @@
 """Choose the compiled core, where it is built, or the Python code beside it, which does the same and is the reference.
 
-`_core.c` appends records to a mapped segment and reads them back; `build.py` compiles it when the package is installed.
-Each function here does the cases that need no decision, as many as it can, and returns; the caller does the others. The
-functions of the Python core do none. So the callers hold the rules once, and run the same with both.
+`_core.c` appends records to a mapped segment, reads them back and makes the values of their rows; `build.py` compiles
+it when the package is installed. `Tail.append` and `take_records` do the cases that need no decision, as many as they
+can, and return; the caller does the others. Those of the Python core do none. So the callers hold the rules once, and
+run the same with both.
 
 `PYCRORM_PURE=1` chooses Python. So does a Python without the interpreter lock, which the compiled core relies on.
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import BuiltinMethodType, MethodWrapperType, ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -81,6 +82,10 @@ def _take_nothing(*arguments: Any) -> tuple[int, int, int]:
     return arguments[1], arguments[3], arguments[5]
 
 
+def _event_values(records: Sequence[Sequence[Any]], number: int) -> tuple[Any, ...]:
+    return tuple([value for each in records for value in (number, *each[2:-1], each[-1].decode())])
+
+
 if TYPE_CHECKING:
     Tail = PythonTail
 else:
@@ -93,3 +98,7 @@ The arguments are the buffer, the offset, the segment's salt, the position of th
 bytes of the payloads so far and at most, the names of event types by their bytes, the class `Record`, the list or None;
 and for a scan, else None: the open episodes, which the call updates, and a list to which it appends the checksums.
 """
+
+event_values: Final[Callable[[list[Any], int], tuple[Any, ...]]] = getattr(_compiled, "event_values", _event_values)
+"""Return the values of the rows of these records, one row after the other: the number, then those from the sequence on,
+with the payload as text."""

@@ -1,4 +1,4 @@
-/* Append a record to a mapped segment, and read records back: the parts of the queue that run for every event.
+/* Append a record to a mapped segment, read records back, and make the values of rows: what runs for every event.
  *
  * The Python code beside each call is the reference, and runs where this file is not compiled. Only cases that need no
  * decision are done here: an event of an open episode that fits into the current segment, and whole frames that follow
@@ -427,6 +427,34 @@ static PyObject *take_records(PyObject *Py_UNUSED(module), PyObject *arguments) 
     return failed ? NULL : Py_BuildValue("(nKK)", (Py_ssize_t)offset, position, total);
 }
 
+/* === store ===================================================================================================== */
+
+/* event_values(records, number) -> the values of the events' rows, one row after the other */
+static PyObject *event_values(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    enum { COLUMNS = 7 };
+    PyObject *records, *number;
+    if (!PyArg_ParseTuple(arguments, "O!O", &PyList_Type, &records, &number)) return NULL;
+    Py_ssize_t count = PyList_Size(records);
+    PyObject *values = PyTuple_New(COLUMNS * count);
+    for (Py_ssize_t at = 0; values && at < count; at++) {
+        PyObject *record = PyList_GetItem(records, at), *payload = record ? PyTuple_GetItem(record, COLUMNS) : NULL;
+        char *bytes;
+        Py_ssize_t size;
+        if (!payload || PyBytes_AsStringAndSize(payload, &bytes, &size) < 0) goto failed;
+        PyObject *text = PyUnicode_DecodeUTF8(bytes, size, NULL);
+        if (!text) goto failed;
+        PyTuple_SetItem(values, COLUMNS * at, Py_NewRef(number));
+        for (int n = 2; n < COLUMNS; n++) /* from the sequence to the monotonic time */
+            PyTuple_SetItem(values, COLUMNS * at + n - 1, Py_NewRef(PyTuple_GetItem(record, n)));
+        PyTuple_SetItem(values, COLUMNS * at + COLUMNS - 1, text);
+    }
+    return values;
+
+failed:
+    Py_DECREF(values);
+    return NULL;
+}
+
 /* === module ==================================================================================================== */
 
 #ifndef SOURCE
@@ -444,7 +472,10 @@ static PyObject *py_crc32(PyObject *Py_UNUSED(module), PyObject *arguments) { /*
 }
 
 static PyMethodDef methods[] = {
-    {"take_records", take_records, METH_VARARGS, NULL}, {"crc32", py_crc32, METH_VARARGS, NULL}, {0}};
+    {"take_records", take_records, METH_VARARGS, NULL},
+    {"event_values", event_values, METH_VARARGS, NULL},
+    {"crc32", py_crc32, METH_VARARGS, NULL},
+    {0}};
 
 static int fill_module(PyObject *module) {
     make_tables();

@@ -28,7 +28,7 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from hashlib import sha256
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
@@ -372,7 +372,7 @@ class Appending:
         steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
         extending = [known_rows[each] for each, change in steps.items() if change.fresh]
         digests = None if self._digests is None else await self._digests.begin(connection, extending)
-        insertion = await self._dialect.insertion({("event", schema.EVENT_COLUMNS): _rows(steps.values(), digests)})
+        insertion = await self._dialect.event_insertion(_parts_of(steps.values(), digests))
         return _Plan(known_rows, steps, insertion, digests)
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
@@ -423,20 +423,17 @@ class Appending:
         return numbers
 
 
-def _rows(steps: Iterable[EpisodeStep], digests: Extension | None) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of the new events, and add these to the digests."""
+def _parts_of(steps: Iterable[EpisodeStep], digests: Extension | None) -> Iterator[tuple[int, list[Record]]]:
+    """Yield the new events in parts, each with its episode's number, and add these to the digests."""
     for each in steps:
         number = each.after.number
         for part, last in _parts(each):
             if digests is not None:
                 digests.add(number, part, last=last)
-            yield from [
-                (number, sequence, type_name, version, wall_ns, monotonic_ns, payload.decode())
-                for _, _, sequence, type_name, version, wall_ns, monotonic_ns, payload in part
-            ]
+            yield number, part
 
 
-def _parts(change: EpisodeStep) -> Iterator[tuple[Sequence[Record], bool]]:
+def _parts(change: EpisodeStep) -> Iterator[tuple[list[Record], bool]]:
     """Split an episode's new events; yield each part, and whether it is the episode's end or a tag behind the end."""
     events = change.fresh
     last = len(events)
@@ -573,7 +570,8 @@ class Blobs:
 
         A blob that the source no longer has is reported and left out: waiting would not bring it back.
         """
-        wanted = {each.hash: each for record in records for each in references_in(record.type, record.payload)}
+        referring = [each for each in records if b'"$blob"' in each.payload]
+        wanted = {each.hash: each for record in referring for each in references_in(record.type, record.payload)}
         if not wanted or self.source is None:
             return
         for name in wanted.keys() - await self.complete(wanted):

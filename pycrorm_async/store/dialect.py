@@ -18,6 +18,7 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import PycrormError
+from pycrorm_async.events.codec import Record
 from pycrorm_async.store import schema
 from pycrorm_async.store.stored import Span, StoredEvent
 
@@ -289,8 +290,17 @@ class Dialect(ABC):
     async def insertion(self, rows: RowsByTable) -> Insertion:
         """Prepare the insertion of these rows, before the transaction, so that it is short. Yields to other tasks.
 
-        The rows are read now, or once while they are inserted. Those of the table `event` have their payload as text.
+        The rows are read now, or once while they are inserted.
         """
+
+    async def event_insertion(self, parts: Iterable[tuple[int, list[Record]]]) -> Insertion:
+        """Prepare the insertion of events as `insertion` does; each part has records and their episode's number."""
+        rows = (
+            (number, sequence, type_name, version, wall_ns, monotonic_ns, payload.decode())
+            for number, records in parts
+            for _, _, sequence, type_name, version, wall_ns, monotonic_ns, payload in records
+        )
+        return await self.insertion({(schema.EVENT.name, schema.EVENT_COLUMNS): rows})
 
     @abstractmethod
     async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
 import msgspec
 from sqlalchemy import CheckConstraint, DefaultClause, Select, Table
@@ -23,8 +23,10 @@ from sqlalchemy.dialects.sqlite.aiosqlite import SQLiteDialect_aiosqlite
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async import core
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable
+from pycrorm_async.events.codec import Record
 from pycrorm_async.store import dialect, schema, sqlite_engine
 from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, Connection, claim
 from pycrorm_async.store.stored import Span, StoredEvent
@@ -190,6 +192,16 @@ class SQLite(dialect.Dialect):
                 await asyncio.sleep(0)
         return insertions
 
+    async def event_insertion(self, parts: Iterable[tuple[int, list[Record]]]) -> dialect.Insertion:
+        columns = schema.EVENT_COLUMNS
+        into = f"INSERT INTO {schema.EVENT.name} ({', '.join(columns)}) VALUES "
+        insertions = []
+        for number, records in parts:
+            some = _parts(records, len(columns))
+            insertions += [(into + _marks(len(each), len(columns)), core.event_values(each, number)) for each in some]
+            await asyncio.sleep(0)
+        return insertions
+
     async def insert(self, connection: AsyncConnection, insertion: dialect.Insertion) -> None:
         with _rows_refused():
             await (await _driver(connection)).execute_in_turn(insertion)
@@ -259,24 +271,28 @@ def _rows_refused() -> Iterator[None]:
 _PARAMETERS_MAX: Final = 8_000
 """Bounds the parameters of a statement. SQLite allows 32,766 but is a third slower with that many; with fewer, the
 writer waits for a busy plan more often."""
+_Rows = TypeVar("_Rows", bound=Sequence[Any])
 _NULL: Final = float("nan")
 """The value bound in place of None: SQLite stores NaN, which no row has, as NULL."""
 
 
 def bound(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[tuple[str, tuple[Any, ...]]]:
     """Generate VALUES lists and their parameters, some rows at a time. The lists differ by their length alone."""
-    marks = f"({', '.join('?' * columns)})"
     for part in _parts(rows, columns):
-        yield ", ".join([marks] * len(part)), _values(part)
+        yield _marks(len(part), columns), _values(part)
 
 
-def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[tuple[Any, ...]]]:
+def _marks(rows: int, columns: int) -> str:
+    return ", ".join([f"({', '.join('?' * columns)})"] * rows)
+
+
+def _parts(rows: _Rows, columns: int) -> Iterator[_Rows]:
     """Split rows into powers of two, so that few statements differ: compiling one takes longer than running it."""
     size, start = 1 << (_PARAMETERS_MAX // columns).bit_length() - 1, 0
     while start < len(rows):
         while size > len(rows) - start:
             size //= 2
-        yield rows[start : start + size]
+        yield rows[start : start + size]  # type: ignore[misc]  # a slice has the type of its sequence
         start += size
 
 

@@ -39,7 +39,7 @@ from pycrorm_async.queue.format import (
     salt_of,
 )
 from pycrorm_async.queue.scan import SegmentScanner
-from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, append, ended, episode, node, started
+from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, append, ended, episode, node, record, started
 
 ROOT = Path(__file__).parent.parent.parent
 compiled = pytest.mark.skipif(not core.IS_COMPILED, reason=f"the core is not compiled: {core.PURE_REASON}")
@@ -332,6 +332,32 @@ def test_whole_folders_are_read_alike_and_by_the_compiled_core(two_segments: Fol
     assert outcome[-4] == two_segments.records
     with python_alone():
         assert outcome_of(two_segments.folder, len(two_segments.records)) == outcome
+
+
+# === rows =====================================================================================================
+
+
+@compiled
+@given(
+    st.lists(
+        st.builds(
+            lambda text, wall: record(1, node(), 1, text.encode())._replace(wall_ns=wall), st.text(), st.integers()
+        )
+    )
+)
+def test_both_cores_make_the_same_values_of_rows(records: list[Record]) -> None:
+    assert core.event_values(records, 4_194_303) == core._event_values(records, 4_194_303)
+
+
+@compiled
+def test_values_of_records_that_no_database_holds_are_refused_by_both_cores() -> None:
+    damaged = record(1, node(), 1, b"\xff")
+    for make in (core.event_values, core._event_values):
+        with pytest.raises(UnicodeDecodeError):
+            make([record(1, node(), 1, b"{}"), damaged], 1)
+    for wrong in (damaged[:7], "text", damaged._replace(payload="text")):  # type: ignore[arg-type]
+        with pytest.raises((TypeError, IndexError, SystemError)):
+            core.event_values([wrong], 1)
 
 
 # === building =================================================================================================
