@@ -10,10 +10,12 @@ run the same with both.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import BuiltinMethodType, MethodWrapperType, ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,9 +27,13 @@ def _load() -> tuple[ModuleType | None, str]:
     if "t" in sys.abiflags:
         return None, "this Python runs without the interpreter lock"
     try:
-        return importlib.import_module(f"{__name__}._core"), ""
+        compiled = importlib.import_module(f"{__name__}._core")
     except ImportError as error:
-        return None, str(error) if hasattr(error, "path") and error.path else "it was installed without a C compiler"
+        return None, str(error) if error.path else "it was installed without a C compiler"
+    source = Path(__file__).with_name("_core.c")  # which a wheel does not have
+    if source.exists() and hashlib.sha256(source.read_bytes()).hexdigest() != compiled.SOURCE:
+        return None, "_core.c was changed and not compiled again, with `python pycrorm_async/core/build.py`"
+    return compiled, ""
 
 
 _compiled, PURE_REASON = _load()

@@ -40,6 +40,8 @@ class CompiledCore(BuildHookInterface[Any]):
         try:
             compile_core(Path(self.root, _SOURCE), library)
         except NotCompiled as reason:
+            if is_editable:
+                library.unlink(missing_ok=True)  # of an earlier installation
             self.app.display_warning(f"the queue is not compiled, so recording takes longer: {reason}")
             return
         if not is_editable:
