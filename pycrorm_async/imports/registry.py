@@ -32,6 +32,7 @@ _BUILT_IN: Final = {
     "btlog": "btlog",
     "mcap": "bags",
     "rosbag2": "bags",
+    "lerobot": "lerobot",
     "neem": "neem",
 }
 """The modules of the built-in formats, by name, loaded when they are used. `FORMAT` in each is its `ImportFormat`."""
