@@ -47,7 +47,9 @@ def export(
     ] = None,
     file_format: Annotated[
         str | None,
-        typer.Option("--format", help="parquet, csv, jsonl, lerobot, rrd, mcap, trace or otlp; default: the suffix."),
+        typer.Option(
+            "--format", help="parquet, csv, jsonl, lerobot, rrd, mcap, trace, otlp or neem; default: the suffix."
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="PATH", help="The file or folder to write.")] = None,
     episode: Annotated[

@@ -31,6 +31,7 @@ from sqlalchemy import inspect as inspect_database
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written
 from pycrorm_async.export.lerobot import LEROBOT, ImageSize, check_size
+from pycrorm_async.export.neem import NEEM
 from pycrorm_async.export.scenes import MCAP, RERUN, Clock
 from pycrorm_async.export.selection import (
     Exportable,
@@ -57,8 +58,8 @@ if TYPE_CHECKING:
 
 
 FileFormat: TypeAlias = str
-"""The name of a format: `parquet`, `csv` or `jsonl` for rows, `lerobot`, `rrd`, `mcap`, `trace` or `otlp` for episodes,
-or one of an installed package."""
+"""The name of a format: `parquet`, `csv` or `jsonl` for rows, `lerobot`, `rrd`, `mcap`, `trace`, `otlp` or `neem` for
+episodes, or one of an installed package."""
 
 FORMATS: Final = {
     "parquet": PARQUET,
@@ -69,6 +70,7 @@ FORMATS: Final = {
     "mcap": MCAP,
     "trace": TRACE,
     "otlp": OTLP,
+    "neem": NEEM,
 }
 """The built-in formats by name."""
 

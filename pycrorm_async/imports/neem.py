@@ -22,6 +22,7 @@ nothing.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections import Counter, defaultdict
@@ -29,11 +30,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
+
+from msgspec.structs import replace
 
 from pycrorm_async.events.types import NodeStatus, ObjectValue, PoseValue
+from pycrorm_async.export import neem_vocabulary as vocabulary
 from pycrorm_async.imports import intake as intakes
-from pycrorm_async.imports import neem_vocabulary as vocabulary
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
 from pycrorm_async.imports.neem_files import FileCut, NeemFiles, Transform, documents, neems_in, transforms, triples
 from pycrorm_async.imports.spans import Other, Span, give_spans
@@ -200,6 +203,10 @@ class Facts:
             members.setdefault(roots.get(above, alone), []).append(action)
         return [EpisodeFacts(iri, actions) for iri, actions in members.items() if actions or len(members) == 1]
 
+    def with_name(self) -> list[str]:
+        """Return the objects that our export wrote."""
+        return [s for s, of in self._objects.items() if "object_name" in of]
+
     def interval(self, action: str) -> tuple[float | None, float | None]:
         """Return when an action began and ended, s since 1970; None where that is not known."""
         times: list[float | None] = []
@@ -229,6 +236,23 @@ class Facts:
             counts["objects without a location"] += self.place(each) is None and not self.all(each, "hasLocalization")
             counts["objects without a shape"] += not (self.all(each, "hasShape") or self.all(each, "hasShapeRegion"))
         return {finding: count for finding, count in counts.items() if count}
+
+    def own(self, action: str) -> Mapping[str, Any] | None:
+        """Return what our export wrote of a node; None of another action."""
+        text = self.iri(action, "node")
+        try:
+            own = json.loads(text) if text is not None else None
+        except ValueError:
+            return None
+        is_whole = (
+            isinstance(own, dict)
+            and own.keys() >= {"dtype", "kind", "status", "start_ns", "end_ns", "parameters"}
+            and own["kind"] in ("action", "motion", "language")
+            and isinstance(own["parameters"], dict)
+            and isinstance(own["start_ns"], int)
+            and isinstance(own["end_ns"], int | None)
+        )
+        return own if is_whole else None
 
     def participants(self, action: str) -> list[str]:
         """Return the IRIs of an action's participants, without the literal NIL."""
@@ -344,7 +368,8 @@ class _Episode:
             give_spans(episode, self._spans, self._others(episode, begin, cuts))
             roots = [each for each in self._spans if each.parent is None]
             status = roots[0].status if len(roots) == 1 else "UNKNOWN"
-            episode.ended("INTERRUPTED" if status == "CANCELLED" else status, last)
+            status = "INTERRUPTED" if status == "CANCELLED" else status
+            episode.ended(self._facts.iri(own.iri, "status") or status, last)
 
     # --- actions ----------------------------------------------------------------------------------------------
 
@@ -360,6 +385,9 @@ class _Episode:
                 intervals[above] = begin, intervals[above][1]
         spans = []
         for action, (begin, end) in intervals.items():
+            if (own := facts.own(action)) is not None:
+                spans.append(self._own_span(action, own))
+                continue
             above = facts.parents.get(action)
             around = intervals.get(above or "", (None, None))[0]
             start = begin if begin is not None else around if around is not None else base
@@ -379,6 +407,23 @@ class _Episode:
                 self._intake.left_out("participants", "they are the literal NIL", nil)
             spans.append(span)
         return spans
+
+    def _own_span(self, action: str, own: Mapping[str, Any]) -> Span:
+        """Return the node that our export wrote."""
+        above = self._facts.parents.get(action)
+        span = Span(action, str(own["dtype"]), {}, own["start_ns"], own["end_ns"])
+        span.parent = above if above in self._members else None
+        span.kind = own["kind"]
+        span.status = own["status"] if own["status"] in get_args(NodeStatus) else "UNKNOWN"
+        span.status = "UNKNOWN" if span.status == "RUNNING" else span.status
+        failure = own.get("failure")
+        span.failure = (str(failure[0]), str(failure[1])) if failure else None
+        span.result = own.get("result")
+        span.late = lambda episode: {
+            name: self._object(each["$object"], episode) if isinstance(each, dict) and "$object" in each else each
+            for name, each in own["parameters"].items()
+        }
+        return span
 
     def _outcome(self, action: str) -> tuple[NodeStatus, tuple[str, str] | None]:
         facts = self._facts
@@ -432,6 +477,9 @@ class _Episode:
         return ObjectValue("BelieveObject", vocabulary.local(iri), self._object_type(iri))
 
     def _object_type(self, iri: str) -> str:
+        own = self._facts.iri(iri, "object_type")
+        if own is not None:
+            return own
         name = _snake(vocabulary.local(self._facts.class_of(iri))).upper()
         return name if name in ObjectType.__members__ else "GENERIC_OBJECT"
 
@@ -443,7 +491,8 @@ class _Episode:
     def _others(self, episode: IntakeEpisode, begin: int, cuts: list[FileCut]) -> Iterator[Other]:
         """Yield the poses of objects and the streams of frames, in the order of time."""
         robots = {each for a in self._own.actions if (each := self._facts.iri(a, "isPerformedBy")) is not None}
-        objects = dict.fromkeys([*robots, *(each for a in self._own.actions for each in self._facts.participants(a))])
+        participants = (each for a in self._own.actions for each in self._facts.participants(a))
+        objects = dict.fromkeys([*robots, *participants, *self._facts.with_name()])
         for iri in objects:
             place = self._facts.place(iri)
             if place is not None:
@@ -456,8 +505,10 @@ class _Episode:
             at = max(at, each.at)
             if count % 10_000 == 0:
                 self._intake.progress(count, count)
-            if frames.place(each):
+            if (moved := frames.place(each)) is not None:
                 due = min(due, at)
+                if each.is_own:
+                    yield at, partial(self._add, episode, moved, moved in robots, frames.pose(moved, at))
             elif self._settings.streams:
                 block = streams[each.parent, each.child]
                 block.append(each)
@@ -489,7 +540,7 @@ class _Episode:
             episode.object_moved(iri, pose, at)
         else:
             kind = "ROBOT" if is_robot else self._object_type(iri)
-            episode.object_added(iri, vocabulary.local(iri), kind, pose, at)
+            episode.object_added(iri, self._facts.iri(iri, "object_name") or vocabulary.local(iri), kind, pose, at)
 
 
 class _ObjectFrames:
@@ -502,8 +553,8 @@ class _ObjectFrames:
         self._robot_frames = (robot_frame,) if robot_frame else _ROBOT_FRAMES
         self._placed: dict[str, str] = {}
 
-    def place(self, transform: Transform) -> bool:
-        """Note where a frame is; return whether it is that of an object."""
+    def place(self, transform: Transform) -> str | None:
+        """Note where a frame is; return the object that it is the frame of."""
         child = transform.child
         pose = PoseValue(transform.position, transform.orientation, transform.parent, transform.at)
         self._frames.place(child, pose)
@@ -511,16 +562,20 @@ class _ObjectFrames:
         if iri is None and child in self._robot_frames and len(self._robots) == 1:
             iri = self._robots[0]
             if self._placed.get(iri, child) not in self._robot_frames:
-                return False
-        if iri is None:
-            return False
-        self._placed.setdefault(iri, child)
-        return True
+                return None
+        if iri is not None:
+            self._placed.setdefault(iri, child)
+        return iri
 
     def poses(self, at: int) -> Iterator[tuple[str, PoseValue]]:
         """Yield the pose of each object whose frame was seen, in the topmost frame that is known."""
-        for iri, frame in self._placed.items():
-            yield iri, self._frames.in_root(PoseValue((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), frame, at))
+        for iri in self._placed:
+            yield iri, self.pose(iri, at)
+
+    def pose(self, iri: str, at: int) -> PoseValue:
+        """Return the pose of an object whose frame was seen."""
+        place = self._frames.place_of(self._placed[iri])
+        return replace(self._frames.in_root(place), time_ns=at)
 
 
 def _give_stream(episode: IntakeEpisode, block: list[Transform], _at: int) -> None:

@@ -26,8 +26,8 @@ from typing import IO, Any, Final, Literal, NamedTuple, cast
 
 from pycrorm_async.errors import FilesError, MissingExtra
 from pycrorm_async.events.codec import clean
+from pycrorm_async.export.neem_vocabulary import RDF_TYPE
 from pycrorm_async.imports.intake import WrongFormat
-from pycrorm_async.imports.neem_vocabulary import RDF_TYPE
 
 Kind = Literal["triples", "tf", "annotations", "inferred", "meta"]
 KINDS: Final[tuple[Kind, ...]] = ("triples", "tf", "annotations", "inferred", "meta")
@@ -35,6 +35,8 @@ _SUFFIXES: Final = (".bson", ".json", ".jsonl", ".ndjson", ".jsonld")
 _NAME: Final = re.compile(r"(?:(?P<neem>.*)_)?(?P<kind>triples|tf|annotations|inferred|meta)")
 _LINES_MAX: Final = 2**24
 """Bounds the bytes of one line of JSON: a document of MongoDB has at most 16 MiB."""
+_UNIT: Final = 1e-6
+"""The length of a quaternion that differs from 1 by less is that of rounding, and kept."""
 _Documents = Iterator[Mapping[str, Any]]
 
 
@@ -52,13 +54,17 @@ class Triple(NamedTuple):
 
 
 class Transform(NamedTuple):
-    """Where a frame was: UTC in ns, its parent, itself, position in m, quaternion xyzw."""
+    """Where a frame was: UTC in ns, its parent, itself, position in m, quaternion xyzw.
+
+    `is_own`: whether our export wrote it, of an object of our memory, with its time in ns.
+    """
 
     at: int
     parent: str
     child: str
     position: tuple[float, float, float]
     orientation: tuple[float, float, float, float]
+    is_own: bool = False
 
 
 @dataclass
@@ -367,4 +373,7 @@ def transforms(path: Path, left_out: Any) -> Iterator[Transform]:
         if not (0.5 < norm < 2) or not abs(x) + abs(y) + abs(z) < 1e9 or not 0 <= at < 2**63:
             left_out("transforms", "they have no rotation, or a number out of range")
             continue
-        yield Transform(at, parent, child, (x, y, z), (qx / norm, qy / norm, qz / norm, qw / norm))
+        turn = (qx, qy, qz, qw) if abs(norm - 1) < _UNIT else (qx / norm, qy / norm, qz / norm, qw / norm)
+        own = document.get("__ns")
+        is_own = isinstance(own, int) and 0 <= own < 2**63
+        yield Transform(cast("int", own) if is_own else at, parent, child, (x, y, z), turn, is_own)

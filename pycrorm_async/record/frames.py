@@ -28,6 +28,10 @@ class Frames:
         if frame != MAP and (frame in self._places or len(self._places) < _FRAMES_MAX):
             self._places[frame] = pose
 
+    def place_of(self, frame: str) -> PoseValue:
+        """Return the latest place of a frame. Raises `KeyError` for one that was never placed."""
+        return self._places[frame]
+
     def in_map(self, pose: PoseValue) -> PoseValue:
         """Return the pose in the map; the same one if the places of its frame and of those above are not all known."""
         composed = self.in_root(pose)

@@ -10,10 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
+from pycrorm_async.imports import intake
 from pycrorm_async.imports.neem import validate
 from pycrorm_async.imports.registry import import_files
 from tests.databases import ask
@@ -179,3 +181,17 @@ def test_numbers_that_are_none_and_hostile_names_are_survived(tmp_path: Path) ->
     assert_verified(tmp_path)
     assert [each.nodes for each in report.episodes] == [8]
     assert report.left_out["documents", "they are no triples: subject or predicate is missing"] == 2
+
+
+def test_the_questions_of_the_page_have_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imported(tmp_path, "neem", neems.neem_folder(tmp_path / "neem"))
+    page = (Path(intake.__file__).parent / "neem.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    wide = ("display.width", 10_000, "display.max_columns", None, "display.max_colwidth", None)
+    with pd.option_context(*wide):
+        exec(page.split("```python\n")[1].split("```")[0], {"__name__": "page"})
+    answers = capsys.readouterr().out
+    for each in ("GripAction", "ManipulationPoseUnreachable", "Breakfast", "tf base_footprint camera", "Accessing"):
+        assert each in answers

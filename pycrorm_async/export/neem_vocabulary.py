@@ -17,7 +17,7 @@ SOMA: Final = "http://www.ease-crc.org/ont/SOMA.owl#"
 DUL: Final = "http://www.ontologydesignpatterns.org/ont/dul/DUL.owl#"
 RDF_TYPE: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type"
 RDFS: Final = "http://www.w3.org/2000/01/rdf-schema#"
-OWN: Final = "urn:pycrorm:"
+OWN: Final = "urn:pycrorm:neem#"
 """The beginning of the IRIs that the export adds: what our memory knows, and the vocabulary has no relation for."""
 
 CLASSES_OF_NO_USE: Final = frozenset({"NamedIndividual", "Thing", "Entity", "Object", "Resource"})
