@@ -54,7 +54,6 @@ RUNS = (
     Run("gate", middle=()),
     Run("rivals", middle=("--turns", "8", "--kills", "1")),
     Run("start", middle=()),
-    Run("hook"),
     Run("busy", middle=()),
     Run("busy postgresql", _POSTGRESQL),
     Run("plan", middle=("--turns", "3")),

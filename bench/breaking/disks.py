@@ -82,9 +82,9 @@ def _fill_under_a_recorder(outcome: Outcome, root: Path, rng: random.Random) -> 
         _fill(root)
         recorder.wait_for("full")
         time.sleep(rng.random() * _LONGEST_LIFE_S / 4)
-        lines = recorder.kill()  # raises if the recorder ended by itself, for example by SIGBUS
+        lines = recorder.kill_and_read()  # raises if the recorder ended by itself, for example by SIGBUS
     finally:
-        recorder.stop()
+        recorder.stop_and_read()
     put_before = [(episode_text(_EPISODE), int(words[1]), words[2]) for words in lines if words[0] == "put"]
     (root / "filler").unlink()
     recovered = [
@@ -269,7 +269,7 @@ def power_cuts(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
                     time.sleep(0.002)
                 disk.fail()
             finally:
-                lines = plan.stop()  # also on SIGTERM to the benchmark, because the disk can be unmounted only then
+                lines = plan.stop_and_read()  # also on SIGTERM: only then can the disk be unmounted
             steps.add(lines, when_synced=True)
         with disk.mounted():
             asyncio.run(recover(url, spool=spool))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import atexit
 import contextlib
 import ctypes
 import itertools
@@ -15,14 +14,13 @@ import signal
 import struct
 import sys
 import tempfile
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
-from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,6 +43,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.crash import recorder_process
 from tests.crash.disk_machine import ROOMY
+from tests.crash.forked_processes import ForkedProcess
 from tests.crash.step_robot import SETTINGS, StepActionPerformable, report
 from tests.databases import Server, ask
 from tests.queue.factories import SMALL, episode, make, node, recover
@@ -56,83 +55,40 @@ from tests.store.factories import run_of
 # Run a function in a child process that prints its progress; the parent keeps the output when the child is killed.
 
 SPAWN = multiprocessing.get_context("forkserver")
-# The fork server imports these once, so that a child starts by a fork instead of a new interpreter with its imports.
-SPAWN.set_forkserver_preload(["bench.breaking.disks", "bench.breaking.files", "rich.progress", "rich.table"])
-_PATIENCE_S = 3600.0
-"""Bounds the wait for output. On a busy machine a process may start for minutes; an exit is noticed at once."""
+_LOADED = ["bench.breaking.disks", "bench.breaking.files", "rich.progress", "rich.table"]
 
 
-class ChildProcess:
-    """Run `target(*arguments)` in a process; a thread reads its output all the time, so that the child never blocks.
+def _fork(process: ForkServerProcess) -> None:
+    """Fork from a server that has imported these modules, instead of starting an interpreter that imports them."""
+    SPAWN.set_forkserver_preload(_LOADED)
+    process.start()
 
-    Start all children from one thread, because starting one reaps the others.
-    """
+
+class ChildProcess(ForkedProcess):
+    """A process whose whole output is read when it has ended: lines, split into words."""
 
     def __init__(self, target: Callable[..., None], *arguments: object) -> None:
-        reader, writer = SPAWN.Pipe(duplex=False)
-        self._process = SPAWN.Process(target=_run, args=(writer, target, *arguments))
-        self._process.start()
-        atexit.register(self._process.kill)  # not daemonic, because a daemonic process must not start fold workers
-        writer.close()
-        self._output = bytearray()
-        self._reader = threading.Thread(target=self._read, args=(reader,), daemon=True)
-        self._reader.start()
+        super().__init__(target, *arguments, start=_fork)
 
-    @property
-    def is_running(self) -> bool:
-        return self._process.is_alive()
+    def kill_and_read(self) -> list[list[str]]:
+        """Send SIGKILL. Raise `RuntimeError` if the process had already ended."""
+        self.process.kill()
+        return self.read_when_killed()
 
-    def wait_for(self, text: str) -> None:
-        """Wait until the output contains this text; raise `RuntimeError` if the child ends before."""
-        deadline = time.monotonic() + _PATIENCE_S
-        while text.encode() not in self._output:
-            if not self.is_running or time.monotonic() > deadline:
-                raise RuntimeError(
-                    f"the child did not print {text!r}; its last output is {bytes(self._output[-200:])!r}"
-                )
-            time.sleep(0.001)
+    def read_when_killed(self) -> list[list[str]]:
+        """Wait until another process, or the child itself, sends SIGKILL. Raise `RuntimeError` if it ends otherwise."""
+        if (code := self.wait()) != -signal.SIGKILL:
+            raise RuntimeError(f"the process was not killed but ended with exit code {code}")
+        return self.words
 
-    def kill(self) -> list[list[str]]:
-        """Send SIGKILL and return the lines, split into words. Raise `RuntimeError` if the child had already ended."""
-        self._process.kill()
-        return self.wait_until_killed()
+    def stop_and_read(self) -> list[list[str]]:
+        """Kill it if it still runs."""
+        self.process.kill()
+        return self.read_at_end()
 
-    def wait_until_killed(self) -> list[list[str]]:
-        """Wait until another process, or the child itself, sends SIGKILL; return its lines."""
-        lines = self.wait()
-        if self._process.exitcode != -9:
-            raise RuntimeError(f"the child was not killed but ended with exit code {self._process.exitcode}")
-        return lines
-
-    def stop(self) -> list[list[str]]:
-        """Kill it if it still runs, and return its lines."""
-        self._process.kill()
-        return self.wait()
-
-    def wait(self) -> list[list[str]]:
-        """Wait until it has ended, and return its lines."""
-        self._process.join()
-        self._reader.join()
-        return self.lines
-
-    @property
-    def lines(self) -> list[list[str]]:
-        """The words of every complete line so far."""
-        output = bytes(self._output)
-        return [line.split() for line in output[: output.rfind(b"\n") + 1].decode().splitlines()]
-
-    def _read(self, reader: Connection) -> None:
-        while chunk := os.read(reader.fileno(), 1 << 20):
-            self._output += chunk
-        reader.close()
-
-
-def _run(out: Connection, target: Callable[..., None], *arguments: object) -> None:
-    """Run the target in the child, with stdout connected to `out`."""
-    os.dup2(out.fileno(), 1)
-    out.close()
-    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
-    target(*arguments)
+    def read_at_end(self) -> list[list[str]]:
+        self.wait()
+        return self.words
 
 
 def kill_me_after(cpu_s: float) -> None:
@@ -162,7 +118,7 @@ def _lines_until_killed(target: Callable[..., None], arguments: tuple[object, ..
     process = ChildProcess(target, *arguments)
     process.wait_for("\n")
     time.sleep(life_s)
-    return process.kill()
+    return process.kill_and_read()
 
 
 # --- recorders ------------------------------------------------------------------------------------------------------
@@ -203,7 +159,7 @@ def _start(place: Path, rng: random.Random) -> _Life:
 
 
 def _compare_recovered(outcome: Outcome, life: _Life) -> None:
-    lines = life.recorder.wait_until_killed()
+    lines = life.recorder.read_when_killed()
     acknowledged = {(line[1], int(line[2])) for line in lines if line[0] == "put"}
     by_position = {int(line[1]): (line[2], int(line[3]), line[4]) for line in lines if line[0] == "stored"}
     ends: list[tuple[int, str, int]] = []
@@ -348,7 +304,7 @@ def exits_with_a_full_queue(rounds: int, rng: random.Random, folder: Path, step:
     outcome = Outcome(note="sys.exit, an uncaught exception, os._exit")
     for _ in range(rounds):
         spool = Path(tempfile.mkdtemp(dir=folder)) / "spool"
-        lines = ChildProcess(_fill_and_exit, str(spool), rng.choice(("exit", "raise", "_exit"))).wait()
+        lines = ChildProcess(_fill_and_exit, str(spool), rng.choice(("exit", "raise", "_exit"))).read_at_end()
         (recorder,) = Spool(spool).recorders()
         recovered = events_of(asyncio.run(recover(recorder.path)))
         name = episode_text(episode(1))
@@ -384,7 +340,7 @@ def second_openers(rounds: int, rng: random.Random, folder: Path, step: Step) ->
         queue.release()
         barrier = SPAWN.Barrier(4)
         drainers = [ChildProcess(_drain_if_unlocked, str(queue.folder), barrier) for _ in range(4)]
-        drained = [line for each in drainers for line in each.wait() if line[0] == "drained"]
+        drained = [line for each in drainers for line in each.read_at_end() if line[0] == "drained"]
         outcome.compare(expected, [(line[1], int(line[2]), line[3] if len(line) > 3 else "") for line in drained])
         shutil.rmtree(queue.folder.parent)
         step()
@@ -478,7 +434,7 @@ def killed_plans(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
         plan = ChildProcess(walk, url, str(spool), "thread", f"plan{number}", rng.randrange(2**31))
         plan.wait_for("did")
         time.sleep(rng.random() * _LONGEST_ROBOT_S)
-        steps.add(plan.kill())
+        steps.add(plan.kill_and_read())
         step()
     asyncio.run(recover_spool(url, spool=spool))
     compare_steps(outcome, steps, url)
@@ -510,17 +466,17 @@ def killed_daemons(server: Server | None) -> Callable[[int, random.Random, Path,
             daemon.wait_for("draining")
             time.sleep(rng.random() ** 2 * 0.5)
             if rng.random() < 0.3:
-                steps.add(plans.pop(rng.randrange(len(plans))).kill())
+                steps.add(plans.pop(rng.randrange(len(plans))).kill_and_read())
                 plans.append(start())
             if server is not None and rng.random() < 0.1:
                 server.kill()
                 time.sleep(rng.random() * 0.1)
                 start_again(server)
-            daemon.kill()
+            daemon.kill_and_read()
             step()
         for each in plans:
             each.wait_for("did")
-            steps.add(each.kill())
+            steps.add(each.kill_and_read())
         asyncio.run(recover_spool(url, spool=spool))
         compare_steps(outcome, steps, url)
         outcome.rounds = rounds
@@ -564,8 +520,8 @@ def faulty_workers(
                 _worker(Spool(spool), other_than=worker)
                 step()
         finally:
-            steps.add(plan.kill())
-            daemon.kill()
+            steps.add(plan.kill_and_read())
+            daemon.kill_and_read()
         asyncio.run(recover_spool(url, spool=spool))
         compare_steps(outcome, steps, url)
         outcome.corrupted += asyncio.run(_differences(url))

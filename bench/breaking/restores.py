@@ -278,9 +278,9 @@ def _round(outcome: Outcome, place: Path, rng: random.Random, name: str) -> None
             file.unlink()
         stored = {each for each, _ in _steps(old)}
         time.sleep(rng.random() ** 2 * _LONGEST_LIFE_S)
-        steps.add(plan.kill())
+        steps.add(plan.kill_and_read())
     finally:
-        plan.stop()
+        plan.stop_and_read()
     asyncio.run(rebind(url, spool=spool, on_rebinding=lambda _: None))
     report = asyncio.run(recover(url, spool=spool))
     if report.failed:

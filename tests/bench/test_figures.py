@@ -101,10 +101,10 @@ def test_every_part_of_the_gate_has_a_ratio_on_record() -> None:
 
 def test_a_repeated_measurement_replaces_its_line_and_nothing_else(tmp_path: Path) -> None:
     _note(tmp_path, "plan", plan(0.04, 0.0)["plan"])
-    _note(tmp_path, "hook", {"bench": "hook", **ABOUT})
+    _note(tmp_path, "gate", {"bench": "gate", **ABOUT})
     _note(tmp_path, "plan", plan(0.02, 0.0)["plan"])
     lines = _lines(tmp_path)
-    assert list(lines) == ["hook", "plan"]
+    assert list(lines) == ["gate", "plan"]
     assert lines["plan"]["with_thread"]["slower_by_median"] == 0.02
 
 
@@ -123,7 +123,7 @@ def test_the_readme_shows_each_table_as_it_was_measured() -> None:
 #
 # Every script in `bench/` runs with --quick and prints one JSON line; the figures themselves are not tested.
 
-BUT = {"busy", "faults", "gate", "hook", "__main__", "pycram"}  # the last needs PyCRAM's environment
+BUT = {"busy", "faults", "gate", "__main__", "pycram"}  # the last needs PyCRAM's environment
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Scripts without a test of their own."""
 SHORT = {"start"}
@@ -139,16 +139,6 @@ def measure(script: str, *options: str) -> dict[str, Any]:
     result = json.loads(line)
     assert result["bench"] == script
     return dict(result)
-
-
-@pytest.mark.soak
-def test_the_cost_of_a_hook_is_measured_with_the_database_up_slow_and_down() -> None:
-    result = measure("hook")
-    states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]
-    assert [name for name in result if isinstance(result[name], dict)] == ["none", *states]
-    for name in ("none", *states):
-        spread = result[name]["perform_us"]
-        assert 0 < spread["median"] <= spread["p99"] <= spread["p99.9"] <= spread["max"]
 
 
 @pytest.mark.soak

@@ -5,27 +5,34 @@ A process's output and input are pipes, and the output pipe keeps what a killed 
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
 
 from tests.commands import FORKED, fork
 
 __all__ = ["ForkedProcess"]
 
-_HANGS_S = 300.0
+Start = Callable[[ForkServerProcess], None]
+
+_HANGS_S = 900.0
+"""A process that takes longer hangs. On a busy machine one may need minutes to start."""
 
 
 class ForkedProcess:
-    """A process that calls `target`, and the lines that it wrote."""
+    """A process that calls `target`, and the lines that it wrote. A thread reads them, so that it never blocks."""
 
-    def __init__(self, target: Callable[..., None], *arguments: object) -> None:
+    def __init__(self, target: Callable[..., None], *arguments: object, start: Start = fork) -> None:
         mine, its_output = FORKED.Pipe(duplex=False)
         its_input, self._input = FORKED.Pipe(duplex=False)
         self.process = FORKED.Process(target=_run_with_pipes, args=(its_input, its_output, target, *arguments))
-        fork(self.process)
+        start(self.process)
+        atexit.register(self.process.kill)  # an interrupted program must not wait for it
         its_input.close()
         its_output.close()
         self._output = mine
@@ -37,6 +44,14 @@ class ForkedProcess:
     def wait_for_first_output(self) -> None:
         assert self._first.wait(_HANGS_S), "it says nothing"
         assert self._bytes, f"it ended without a word, with exit code {self.process.exitcode}"
+
+    def wait_for(self, text: str) -> None:
+        """Wait until the output contains this text; raise `RuntimeError` if the process ends before."""
+        deadline = time.monotonic() + _HANGS_S
+        while text.encode() not in self._bytes:
+            if not self.process.is_alive() or time.monotonic() > deadline:
+                raise RuntimeError(f"the process did not print {text!r}; its last output is {self._bytes[-200:]!r}")
+            time.sleep(0.001)
 
     def kill(self) -> None:
         self.process.kill()
@@ -58,6 +73,11 @@ class ForkedProcess:
         self._output.close()
         self._input.close()
         return self.process.exitcode
+
+    @property
+    def words(self) -> list[list[str]]:
+        """The words of each complete line that the process has written so far."""
+        return [each.split() for each in self.lines]
 
     @property
     def lines(self) -> list[str]:

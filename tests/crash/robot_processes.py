@@ -47,7 +47,7 @@ class RobotProcess:
     @property
     def lines(self) -> list[list[str]]:
         """The words of each complete line that the process has written."""
-        return [line.split() for line in self.forked.lines]
+        return self.forked.words
 
 
 class Lab:
