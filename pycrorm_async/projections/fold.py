@@ -43,23 +43,8 @@ from pycrorm_async.projections.columns import (
     make_table,
     physical_name,
 )
-from pycrorm_async.projections.node_row import (
-    DTYPE,
-    ID,
-    KIND,
-    PARENT_ID,
-    PROCESS_METADATA_ID,
-    ROBOT,
-    ROBOT_OBJECT_ID,
-    ROBOT_POSE_ID,
-    ROBOT_TYPE,
-    RUNNING,
-    SIMULATED,
-    START_NS,
-    START_TIME,
-    TORSO_HEIGHT,
-)
 from pycrorm_async.projections.row_batch import (
+    NO_OUTCOME,
     NOT_FIRST,
     OBJECT_COLUMNS,
     POSE_COLUMNS,
@@ -88,8 +73,6 @@ from pycrorm_async.store.stored import Span, StoredEvent
 #
 # The same events give the same rows, live or rebuilt, in one batch or one by one. An event that cannot be folded raises
 # `CannotFold` before it has added any row, so that its episode can be parked at this event and the others continue.
-
-_NO_OUTCOME: Row = (None, None, None, None)
 
 
 class UndecodablePayload(CannotFold):
@@ -210,33 +193,26 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     node = row_of(number, sequence)
     parameter_rows: ParameterRows = []
     designator = designators.of(started)
-    leaf = designator.rows(event, node, started.parameters, parameter_rows) if designator is not None else ()
-    parent = row_of(number, started.parent) if started.parent is not None else None
-    robot = started.robot
-    robot_object = row_of(number, robot.object.row) if robot is not None and robot.object is not None else None
-    # Nothing below raises, so that an event adds all of its rows or none.
-    rows.nodes[node] = columns = [*RUNNING]
-    columns[ID] = node
-    columns[PROCESS_METADATA_ID] = number
-    columns[PARENT_ID] = parent
-    columns[KIND] = started.kind
-    columns[START_TIME] = wall_ns // 1000
-    columns[START_NS] = monotonic_ns
-    if started.simulated:
-        columns[SIMULATED] = True
-    if robot is not None:
-        if robot.pose is None:
-            columns[ROBOT_POSE_ID] = robot_object  # a row of an object and its pose have one id
-        else:
-            rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
-            columns[ROBOT_POSE_ID] = node + SLOT_ROBOT_POSE
-        columns[TORSO_HEIGHT] = robot.torso_height
-        columns[ROBOT_TYPE] = robot.object_type
-        columns[ROBOT_OBJECT_ID] = robot_object
-        columns[ROBOT] = robot.name
+    kind, dtype, leaf = started.kind, None, ()
     if designator is not None:
-        columns[DTYPE] = designator.dtype
-        columns[KIND] = designator.kind
+        kind, dtype = designator.kind, designator.dtype
+        leaf = designator.rows(event, node, started.parameters, parameter_rows)
+    parent = row_of(number, started.parent) if started.parent is not None else None
+    pose_id = torso_height = robot_type = robot_object = robot_name = None
+    if (robot := started.robot) is not None:
+        torso_height, robot_type, robot_name = robot.torso_height, robot.object_type, robot.name
+        if robot.object is not None:
+            robot_object = row_of(number, robot.object.row)
+        # A row of an object and its pose have one id.
+        pose_id = robot_object if robot.pose is None else node + SLOT_ROBOT_POSE
+    # Nothing below raises, so that an event adds all of its rows or none.
+    rows.nodes[node] = [
+        node, number, parent, kind, dtype, "RUNNING", wall_ns // 1000, monotonic_ns, None, None, None, None, None, None,
+        pose_id, torso_height, robot_type, robot_object, robot_name, started.simulated,
+    ]  # fmt: skip
+    if robot is not None and robot.pose is not None:
+        rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
+    if designator is not None:
         rows.leaves.setdefault(designator.leaf, []).append(leaf)
         for table, each in parameter_rows:
             rows.inserts[table].append(each)
@@ -245,11 +221,11 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
 def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
     number, sequence, _, _, _, monotonic_ns, _ = event
     node, status = row_of(number, ended.node), ended.status
-    outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
-    if not ended.has_time:
-        rows.end_node(node, status, None, None, outcome)
-    else:
+    outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else NO_OUTCOME
+    if ended.has_time:
         rows.end_node(node, status, monotonic_ns, sequence, outcome)
+    else:
+        rows.end_node(node, status, None, None, outcome)
 
 
 def _outcome(ended: NodeEnded) -> Row:
@@ -412,6 +388,9 @@ _decode = Decoder(
 ).decode
 
 for _table, _columns in {
+    "task_tree_node": "id process_metadata_id parent_id kind dtype status start_time start_ns end_ns end_sequence"
+    " reason failure_message failure_arguments result robot_pose_id torso_height robot_type robot_object_id robot"
+    " simulated",
     "object": f"{OBJECT_COLUMNS} joints description_fingerprint color model serial mass_kg base_link",
     "episode_tagging": "id position process_metadata_id tag added time",
     "object_removal": "id process_metadata_id object_id identity_id time node_id",

@@ -1,7 +1,7 @@
 """Collect the rows of one batch of events: those to insert, and changes to rows that the tables contain already.
 
 A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `columns`. Until
-the batch is complete later events change the rows of nodes and episodes, which are lists (`node_row`) and dicts.
+the batch is complete later events change the rows of nodes and episodes, which are lists and dicts.
 """
 
 from __future__ import annotations
@@ -28,12 +28,20 @@ from pycrorm_async.events.types import (
     PoseValue,
 )
 from pycrorm_async.projections.columns import COLUMNS, EPISODE, Union
-from pycrorm_async.projections.node_row import END_NS, END_SEQUENCE, OUTCOME, PROCESS_METADATA_ID, STATUS
 from pycrorm_async.store.stored import StoredEvent
 
 Row: TypeAlias = tuple[Any, ...]
 
 _EPISODE_COLUMNS = itemgetter(*COLUMNS["process_metadata"])
+_NODE_COLUMNS: Final = COLUMNS["task_tree_node"]
+STATUS: Final = _NODE_COLUMNS.index("status")
+"""The place of the status in a node's row."""
+_NODE_EPISODE: Final = _NODE_COLUMNS.index(EPISODE)
+_END_NS: Final = _NODE_COLUMNS.index("end_ns")
+_END_SEQUENCE: Final = _NODE_COLUMNS.index("end_sequence")
+_OUTCOME: Final = slice(_NODE_COLUMNS.index("reason"), _NODE_COLUMNS.index("result") + 1)
+NO_OUTCOME: Final[Row] = (None, None, None, None)
+"""The columns reason to result of a node that has not failed and has no result."""
 
 
 class NodeEnd(NamedTuple):
@@ -62,7 +70,7 @@ class EpisodeEnd(NamedTuple):
     entered_world: str | None
 
 
-assert NodeEnd._fields == ("id", "status", "end_ns", "end_sequence", *COLUMNS["task_tree_node"][OUTCOME])
+assert NodeEnd._fields == ("id", "status", "end_ns", "end_sequence", *_NODE_COLUMNS[_OUTCOME])
 
 
 class Rows:
@@ -101,9 +109,9 @@ class Rows:
             self.node_ends.append(make(NodeEnd, (node, status, end_ns, end_sequence, *outcome)))
             return
         row[STATUS] = status
-        row[END_NS] = end_ns
-        row[END_SEQUENCE] = end_sequence
-        row[OUTCOME] = outcome
+        row[_END_NS] = end_ns
+        row[_END_SEQUENCE] = end_sequence
+        row[_OUTCOME] = outcome
 
     def end_episode(self, end: EpisodeEnd) -> None:
         """Set the end of an episode's row, in this batch or in the tables."""
@@ -118,7 +126,7 @@ class Rows:
     def _lose_nodes(self, number: int) -> None:
         self.lost.append(number)
         for row in self.nodes.values():
-            if row[PROCESS_METADATA_ID] == number and row[STATUS] == "RUNNING":
+            if row[_NODE_EPISODE] == number and row[STATUS] == "RUNNING":
                 row[STATUS] = "LOST"
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:

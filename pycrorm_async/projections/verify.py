@@ -25,9 +25,8 @@ from pycrorm_async.projections.generations import (
     read_generations,
     unmade_types,
 )
-from pycrorm_async.projections.node_row import STATUS
 from pycrorm_async.projections.pipeline import Batch
-from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
+from pycrorm_async.projections.row_batch import STATUS, CannotFold, Designators, Rows
 from pycrorm_async.store import schema, stored
 from pycrorm_async.store.address import no_tables
 from pycrorm_async.store.dialects import dialect_of

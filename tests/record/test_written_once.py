@@ -29,14 +29,16 @@ from pycrorm_async.plan.actions import (
 )
 from pycrorm_async.plan.motions import simulated_robot
 from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.projections.columns import COLUMNS
 from pycrorm_async.projections.fold import fold_happening, happening_of
-from pycrorm_async.projections.node_row import ROBOT_POSE_ID
 from pycrorm_async.projections.row_batch import Designators, Row, Rows
 from pycrorm_async.record.episode_writer import fitted
 from pycrorm_async.record.values import NO_REFERENCES, FailureCopies, failure_value
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.projections.event_script import Script
 from tests.record.fakes import NoteActionPerformable, RecorderCase, recorder_case
+
+ROBOT_POSE_ID = COLUMNS["task_tree_node"].index("robot_pose_id")
 
 
 async def _plan() -> None:
