@@ -172,9 +172,10 @@ class Intake:
         """Open an episode; use it with `with`.
 
         Args:
-            name: the same for the same content (`identity_of`), so that it is imported once.
+            name: the same for the same content (`identity_of`), so that it is imported once. Without a name it is a
+                new episode, which ends LOST if the process dies.
             at: when it began, in ns since 1970.
-            metadata: JSON values; `imported_from` and the format are added.
+            metadata: JSON values; the name of the format is added as `import`.
         """
         settings, format_name = self.settings, self.report.format
         full_name = "/".join(filter(None, ("import", format_name, settings.name, name)))
@@ -184,7 +185,7 @@ class Intake:
         recorded = None
         if self.recording is not None:
             recorded = self.recording.episode(
-                id=full_name,
+                id=full_name if name else None,
                 at=at,
                 description=text,
                 plan=plan,
@@ -192,6 +193,7 @@ class Intake:
                 metadata={"import": format_name, **metadata},
                 created_by=created_by,
             )
+            report.id = str(recorded)
         if identity in self._stored or (recorded is not None and recorded.is_recorded):
             report.state = "already stored"
         return IntakeEpisode(self, report, recorded, at)
