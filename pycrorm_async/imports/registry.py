@@ -34,6 +34,7 @@ _BUILT_IN: Final = {
     "rosbag2": "bags",
     "lerobot": "lerobot",
     "neem": "neem",
+    "pycrorm": "pycram_orm",
 }
 """The modules of the built-in formats, by name, loaded when they are used. `FORMAT` in each is its `ImportFormat`."""
 

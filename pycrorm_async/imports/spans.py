@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
-from pycrorm_async.events.types import NodeStatus
+from pycrorm_async.events.types import NodeStatus, RobotValue
 from pycrorm_async.imports.intake import IntakeEpisode
 
 END, OTHER, START, INSTANT, EMPTY_END = range(5)
@@ -24,6 +24,7 @@ class Span:
     Attributes:
         key: names it in its episode.
         start, end: in ns since 1970; without an end it ends with its episode, or after the last of the other nodes.
+        robot: the state of the robot when the node started.
         late: returns further parameters when the node starts, and takes the episode.
         parent: the key of the node it is inside; the root takes the place of one that is not in the file.
         failure: reason and message.
@@ -42,6 +43,7 @@ class Span:
     result: Any = None
     instants: Sequence[tuple[int, str, object]] = ()
     late: Callable[[IntakeEpisode], Mapping[str, Any]] | None = None
+    robot: RobotValue | None = None
 
 
 def nest(spans: Iterable[Span]) -> None:
@@ -81,7 +83,7 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[O
         elif phase == START:
             parent = what.parent if what.parent in places else None
             parameters = what.parameters if what.late is None else {**what.parameters, **what.late(episode)}
-            episode.start(what.key, what.kind, what.dtype, parameters, what.start, parent=parent)
+            episode.start(what.key, what.kind, what.dtype, parameters, what.start, parent=parent, robot=what.robot)
         elif phase == INSTANT:
             span, (at, name, values) = what
             episode.observe(name, values, at, node=span.key)
