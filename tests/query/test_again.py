@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import Enum
@@ -429,3 +430,32 @@ def test_an_empty_snapshot_makes_an_empty_world_and_a_world_can_be_connected() -
     world = world_of(snapshot(recorded_snapshot("milk")), mode=WorldMode.DIRECT).connect()
     assert [each.name for each in world.objects] == ["milk"]
     world.close()
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["entered inside the episode", "entered before"])
+async def test_an_episode_is_made_again_in_another_engine_which_is_logged(
+    inside: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("mujoco", reason="needs mujoco-core, which the extra [test] installs")
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with nullcontext() if inside else BulletWorld(engine="mujoco"):
+            async with memory.episode(description="in MuJoCo"):
+                with BulletWorld(engine="mujoco") if inside else nullcontext():
+                    Object("pr2", ObjectType.ROBOT).set_joint_position("torso_lift_joint", 0.2)
+                    milk = Object("milk", ObjectType.MILK, pose=Pose([1, 2, 0.5]))
+                    place = milk.world.robot and milk.world.robot.link_pose("l_gripper_tool_frame").position
+                    milk.set_pose(Pose([1, 2, 0.6]))
+        await memory.flush()
+        shown = (await memory.reading.episode("last")).world
+        then = await memory.as_of("last", time=1_000) if not inside else await memory.as_of("last", sequence=5)
+    assert shown is not None
+    assert then.world.engine is not None
+    assert shown.startswith(f"BulletWorld (DIRECT, {then.world.engine}): ")
+    assert then.world.engine.startswith("MuJoCo ")
+    with world_of(then, engine="mujoco") as same:
+        assert same.engine_title == then.world.engine
+    assert caplog.text == ""
+    with world_of(then, engine="bullet") as world:
+        assert place == pytest.approx(world.object("pr2").link_pose("l_gripper_tool_frame").position, abs=1e-9)
+    recorded_in = f"the episode was recorded in a world of {then.world.engine}, and this one is of Bullet"
+    assert caplog.text.count(recorded_in) == 1
