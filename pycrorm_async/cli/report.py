@@ -90,7 +90,12 @@ def _write_overview(
     else:
         output.print_line(written.path)
         episodes = output.counted(written.episodes, "episode")
-        output.note(f"It has {episodes}; pages of {written.pages} are in {out.stem}.pages beside it.")
+        listed = f"the newest {episodes} of {written.left_out + written.episodes:,}" if written.left_out else episodes
+        output.note(f"It has {listed}; pages of {written.pages} are in {out.stem}.pages beside it.")
+        if written.left_out:
+            output.note("--since, --status, --tag, --robot and --text choose others.")
+        if written.pages + len(written.unreadable) < written.episodes:
+            output.note("The others have no page: `pycrorm report NUMBER` writes one.")
     for number, reason in written.unreadable.items():
         output.problem(f"episode {number} has no page: {reason}")
     return 1 if written.unreadable else 0

@@ -287,8 +287,13 @@ _REASON_MAX = 500
 
 async def newest_episodes(reading: Reading, choice: EpisodeChoice | None = None) -> tuple[list[EpisodeSummary], int]:
     """Return the newest of all episodes, or of a choice, the oldest first, and the number of all of them."""
-    summaries = await reading.episodes(choice)
-    return summaries[-_EPISODES_MAX:], len(summaries)
+    choice = choice or EpisodeChoice()
+    limit = min(choice.limit or _EPISODES_MAX, _EPISODES_MAX)
+    summaries = await reading.episodes(replace(choice, limit=limit))
+    if len(summaries) < limit or limit == choice.limit:
+        return summaries, len(summaries)
+    [(total,)] = await reading.rows(choice.counted())
+    return summaries, total if choice.limit is None else min(total, choice.limit)
 
 
 async def overview_document(
@@ -303,7 +308,8 @@ async def overview_document(
 
     `pages` are the addresses of their pages, `unreadable` the reasons why others have none, both by number.
     """
-    failures, actions = await failures_by_reason(reading), await _actions(reading)
+    first = min((each.number for each in episodes), default=0)
+    failures, actions = await failures_by_reason(reading, first=first), await _actions(reading, first)
     return {
         "title": title,
         "total": total,
@@ -330,11 +336,11 @@ async def overview_document(
 
 
 async def failures_by_reason(
-    reading: Reading, numbers: Collection[int] | None = None
+    reading: Reading, numbers: Collection[int] | None = None, *, first: int = 0
 ) -> dict[int, dict[str, dict[str, int]]]:
-    """Count root failures, of all episodes or of those with these numbers, by episode, reason and outcome."""
+    """Count root failures by episode, reason and outcome: of episodes with these numbers, or from `first` on."""
     columns = RootFailure.process_metadata_id, RootFailure.reason, RootFailure.outcome
-    query = select(*columns, func.count()).group_by(*columns)
+    query = select(*columns, func.count()).where(columns[0] >= first).group_by(*columns)
     if numbers is not None:
         query = query.where(RootFailure.process_metadata_id.in_(numbers))
     counts: dict[int, dict[str, dict[str, int]]] = {}
@@ -353,12 +359,14 @@ async def outcomes_of(reading: Reading, number: int) -> dict[str, str]:
     return {str(row.sequence): row.outcome for row in rows}
 
 
-async def _actions(reading: Reading) -> dict[int, dict[str, list[int]]]:
-    """Count successes and tries of the actions of each episode, by type."""
+async def _actions(reading: Reading, first: int) -> dict[int, dict[str, list[int]]]:
+    """Count successes and tries of the actions of each episode from the number `first` on, by type."""
     node = TaskTreeNode
     counted = times_with(node.status == TaskStatus.SUCCEEDED), times_with(node.status.in_(TRIED))
     name = func.coalesce(node.dtype, node.kind)  # another executive may report an action without a type
-    query = select(node.process_metadata_id, name, *counted).where(node.kind == "action")
+    query = select(node.process_metadata_id, name, *counted).where(
+        node.kind == "action", node.process_metadata_id >= first
+    )
     actions: dict[int, dict[str, list[int]]] = {}
     for number, dtype, *counts in await reading.rows(query.group_by(node.process_metadata_id, name)):
         actions.setdefault(number, {})[dtype] = counts
@@ -400,6 +408,7 @@ class SimilarCases:
 
     def __init__(self, reading: Reading, pages: Collection[int] = ()) -> None:
         self._reader = CaseReader(DatabaseSource(reading))
+        self._library: CaseLibrary | None = None
         self._pages = frozenset(pages)
 
     async def document(self, episode: int, starts: Collection[int]) -> dict[str, Any] | None:
@@ -409,11 +418,13 @@ class SimilarCases:
         cases are of another version; with a `fault` if the stored cases are damaged.
         """
         try:
-            library = await self._reader.library()
+            if self._library is None:  # once for all pages, which shows them the same cases
+                self._library = await self._reader.library()
         except (errors.DatabaseUnavailable, errors.TablesPending):
             return None
         except errors.DamageError as fault:
             return {"fault": str(fault)}
+        library = self._library
         cases = _cases_of(library, episode, starts)
         nodes: dict[str, dict[str, Any]] = {}
         texts = _Texts()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
 import os
@@ -23,7 +24,8 @@ from pycrorm_async.cli.main import app
 from pycrorm_async.cli.output import Chosen
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
-from pycrorm_async.report import document
+from pycrorm_async.query.named_queries import EpisodeChoice
+from pycrorm_async.report import document, write
 from pycrorm_async.report.output_files import new_file, new_folder, write_file
 from pycrorm_async.report.write import overview
 from tests.commands import one_line_of, pycrorm
@@ -108,6 +110,31 @@ def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path:
     again = pycrorm("report", "--all", "--out", out, cwd=recorded)
     assert one_line_of(again) == f"pycrorm: {out} exists: add --force to replace it, or give another name"
     assert pycrorm("report", "--all", "--out", out, "--force", cwd=recorded).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_table_of_many_episodes_has_the_newest_and_says_how_many_it_left_out(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(write, "_EPISODES_MAX", 2)
+    monkeypatch.setattr(write, "_PAGES_MAX", 1)
+    url = f"sqlite:///{recorded}/pycrorm.db"
+
+    async def newest(choice: EpisodeChoice | None) -> tuple[list[int], int]:
+        async with Reading.open(url) as reading:
+            listed, total = await write.newest_episodes(reading, choice)
+            return [each.number for each in listed], total
+
+    for choice, total in ((None, 3), (EpisodeChoice(limit=3), 3), (EpisodeChoice(limit=2), 2)):
+        assert asyncio.run(newest(choice)) == ([2, 3], total)
+    shown = CliRunner().invoke(app("report"), ["report", "--all", "--out", str(tmp_path / "all.html"), "--url", url])
+    assert shown.exit_code == 0, shown.output
+    assert shown.stderr.splitlines() == [
+        "It has the newest 2 episodes of 3; pages of 1 are in all.pages beside it.",
+        "--since, --status, --tag, --robot and --text choose others.",
+        "The others have no page: `pycrorm report NUMBER` writes one.",
+    ]
+    assert [each.name for each in (tmp_path / "all.pages").iterdir()] == ["episode-3.html"]
 
 
 @pytest.mark.slow
