@@ -15,7 +15,7 @@ What the formats have no place for is below the key `pycrorm`, so that an import
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -180,8 +180,8 @@ def _us(when: EventTime) -> float:
 # === otlp =====================================================================================================
 
 
-def otlp_document(episode: TracedEpisode) -> dict[str, Any]:
-    """Return the document of an episode: one trace, in the JSON of OTLP."""
+def otlp_document(episode: TracedEpisode, nodes: Iterable[int] | None = None) -> dict[str, Any]:
+    """Return the document of an episode: one trace, in the JSON of OTLP; of all nodes, or of these."""
     started = episode.started
     resource = {
         "service.name": "pycrorm-async",
@@ -189,16 +189,21 @@ def otlp_document(episode: TracedEpisode) -> dict[str, Any]:
         "pycrorm.episode": episode.id,
         "pycrorm.tags": list(episode.tags),
     }
-    spans = [_span(episode, sequence, node) for sequence, node in episode.nodes.items()]
-    by_node = dict(zip(episode.nodes, spans, strict=True))
+    chosen = list(episode.nodes if nodes is None else nodes)
+    spans = {sequence: _span(episode, sequence, episode.nodes[sequence]) for sequence in chosen}
     root = next(iter(episode.nodes), 0)
     for when, observed in episode.observations:
-        span = by_node.get(observed.node or root)
+        span = spans.get(observed.node or root)
         if span is not None:
             values = observed.values if isinstance(observed.values, dict) else {"value": observed.values}
             span["events"].append(_event(episode, when, observed.name, values))
-    scope = {"scope": {"name": "pycrorm_async"}, "spans": spans}
+    scope = {"scope": {"name": "pycrorm_async"}, "spans": [*spans.values()]}
     return {"resourceSpans": [{"resource": {"attributes": _attributes(resource)}, "scopeSpans": [scope]}]}
+
+
+def encoded(document: Mapping[str, Any]) -> bytes:
+    """Return a document as one line of JSON, without its end."""
+    return msgspec.json.encode(document, enc_hook=lambda value: value.tolist())
 
 
 def _span(episode: TracedEpisode, sequence: int, node: ReplayedNode) -> dict[str, Any]:
@@ -269,14 +274,10 @@ async def _write(document_of: Callable[[TracedEpisode], dict[str, Any]], job: Jo
         for covered in job.selection.episodes:
             episode = await read_episode_as(TracedEpisode, job.reading, covered, job.reporter("reading", before))
             document = await run_to_completion(asyncio.to_thread(document_of, episode))
-            file.write(msgspec.json.encode(document, enc_hook=_plain) + b"\n")
+            file.write(encoded(document) + b"\n")
             rows += len(episode.nodes)
             before += covered.events
     return Written(rows)
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist()
 
 
 async def _write_trace(job: Job, path: Path) -> Written:
