@@ -106,6 +106,7 @@ class WriterProcess:
         self.state = WriterProcessState()
         self._assignment = assignment
         self._ending = threading.Event()
+        self._is_closed = False
         self._started: tuple[subprocess.Popen[bytes], Connection] | None = None
         self._thread = threading.Thread(target=self._watch, name="pycrorm writer process", daemon=True)
         call_in_forked_child(self._leave_to_parent)
@@ -124,12 +125,17 @@ class WriterProcess:
         """The reason why the last process ended."""
         return self.state.reason
 
+    def leave(self) -> None:
+        """Let the process store what is left, as after the owner's death, and start no other one."""
+        self._ending.set()
+
     async def end(self, *, at_once: bool) -> None:
         """End the process, and wait until it has ended: by a kill if `at_once`, or if it takes longer than `STOP_S`.
 
-        Ending it may lose nothing, because what is not stored stays in the spool.
+        What is not stored then stays in the spool.
         """
         self._ending.set()
+        self._is_closed = True
         self._ask_to_end(kill=at_once)
         deadline_s = time.monotonic() + STOP_S
         while self._thread.is_alive():
@@ -181,6 +187,8 @@ class WriterProcess:
 
     def _run_process(self) -> str:
         """Run one process to its end; return the cause of the end. Raises `OSError` if it cannot be started."""
+        if not sys.executable:
+            raise OSError("this program does not name its Python interpreter (sys.executable)")
         ours, theirs = Pipe()
         with ours:
             with theirs:
@@ -197,7 +205,7 @@ class WriterProcess:
                 failure = None
                 try:
                     ours.send(self._assignment)
-                    if self._ending.is_set():  # asked before `_started` was set
+                    if self._is_closed:  # asked before `_started` was set
                         ours.send(_CLOSED)
                     failure = self._follow(process, ours)
                 except (EOFError, OSError):
@@ -306,3 +314,7 @@ async def _serve(assignment: WriterAssignment, owner: _Owner) -> None:
             waiting = tasks.create_task(stop_when_over(), name="pycrorm owner")
             await Daemon(destination, destination, folders, settings=settings, report=owner.report).run(stop)
             waiting.cancel()
+        # The daemon stops when the tables show everything: custom projections and views may be behind them.
+        with suppress(PycrormError, TimeoutError):
+            async with asyncio.timeout(STOP_S / 2):
+                await destination.fold()

@@ -254,6 +254,10 @@ class PrivateProcess(Protocol):
         """The reason why the process ended the last time; None if it never did."""
         ...
 
+    def leave(self) -> None:
+        """Let the process drain what is left and end by itself."""
+        ...
+
     async def end(self, *, at_once: bool) -> None:
         """End the process and wait until it has ended; kill it if `at_once`."""
         ...
@@ -287,20 +291,24 @@ class DelegatedWriter:
     async def close(self) -> None:
         """Wait until the queue, which the caller closed, is stored and visible in the tables; then end its process.
 
+        If this is cancelled, the process drains the rest alone.
+
         Stops waiting, with a warning, when no process drains the queue, when the database is unavailable, and after
         `flush_timeout_s` without progress: the next drainer of the spool stores the rest. Raises `EpisodeParked`,
         `TablesPending`.
         """
-        hindrance: str | None = "closing was interrupted"
         try:
             await self._queue.synced_to()
             position = self._queue.written
             hindrance = await self._wait(position, undrained_s_max=_UNDRAINED_S)
-            if hindrance is not None:
-                _log.warning("%s (%s)", self._describe_rest(position), hindrance)
-        finally:
+        except BaseException:
             if self.process is not None:
-                await self.process.end(at_once=hindrance is not None)
+                self.process.leave()
+            raise
+        if hindrance is not None:
+            _log.warning("%s (%s)", self._describe_rest(position), hindrance)
+        if self.process is not None:
+            await self.process.end(at_once=hindrance is not None)
         self._raise_stopped()
 
     async def _wait(

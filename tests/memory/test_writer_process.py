@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from pycrorm_async.errors import CallerError, FlushTimeout
 from pycrorm_async.operations import writer_process
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
-from tests.commands import environment
+from tests.commands import answer, environment
 from tests.databases import ask, put_memory
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.writer.running_writers import QUICKLY_SYNCED, Start, until
@@ -59,8 +60,13 @@ asyncio.run(main(*sys.argv[1:]))  # unguarded: a process that imported this modu
 
 
 def processes() -> list[psutil.Process]:
-    """Return the writer processes of this process."""
-    return [each for each in psutil.Process().children() if "writer_process" in " ".join(each.cmdline())]
+    """Return the writer processes of this process that run."""
+    running = []
+    for each in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):  # also if it has ended and is not reaped yet
+            if "writer_process" in " ".join(each.cmdline()):
+                running.append(each)
+    return running
 
 
 def opened(url: str, spool: Path, settings: Settings = QUICKLY_SYNCED) -> Memory:
@@ -122,6 +128,10 @@ async def test_flushed_records_are_in_the_tables_and_closing_leaves_no_folder_an
         assert (status.drained, status.writer, len(processes())) == (True, None, 1)
         await NoteActionPerformable("b").perform()
     assert (processes(), Spool(tmp_path / "spool").recorders()) == ([], [])
+    shown = await asyncio.to_thread(
+        answer, "status", "--url", database_url, "--spool", tmp_path / "spool", cwd=tmp_path
+    )
+    assert [each["behind"] for each in shown["projections"]] == [0]
     async with Reading.open(database_url) as reading:
         assert await texts(reading) == ["a", "b"]
 
@@ -283,6 +293,20 @@ async def test_a_locked_database_delays_neither_the_plan_nor_closing(
         await until(lambda: len(Spool(spool).recorders()) == 1)
         await memory.flush()
         assert await texts(memory) == ["a", "b"]
+
+
+async def test_a_close_that_is_cancelled_leaves_the_rest_to_the_process(tmp_path: Path) -> None:
+    url, spool = put_memory(tmp_path / "memory.db"), tmp_path / "spool"
+    memory = await opened(url, spool).__aenter__()
+    for number in range(100):
+        await NoteActionPerformable(str(number)).perform()
+    closing = asyncio.create_task(memory.close())
+    await asyncio.sleep(0.1)  # the process is starting
+    closing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await closing
+    await until(lambda: Spool(spool).recorders() == [] and processes() == [])
+    assert ask(url, "SELECT count(*) FROM note_action") == [(100,)]
 
 
 async def test_a_process_that_cannot_be_started_is_named_in_one_line_and_the_events_stay_safe(
