@@ -36,8 +36,8 @@ def rebuild(
             "--workers",
             min=1,
             max=64,
-            help="Processes that fold in parallel. Default: 2 for more than half a million events if two cores are"
-            " idle, else 1.",
+            help="The most processes that fold in parallel, each 125,000 events or more. Default: 2 for more than half"
+            " a million events if two cores are idle, else 1.",
             show_default=False,
         ),
     ] = None,

@@ -34,6 +34,9 @@ SMALL_EVENTS_MAX = 50_000
 _ALONE_EVENTS_MAX = 500_000
 """The largest log that one process folds by default. For 400,000 events two processes took 0.8 times as long as one on
 SQLite, and as long on PostgreSQL."""
+_SHARE_EVENTS_MIN = 125_000
+"""The events for which a process is worth its start, of about two seconds, in which one that runs folds as many. With
+smaller shares two processes take longer than one: half as long again for one episode of 100,000 events."""
 _IDLE_CORES_MIN = 1.5
 """The idle cores that two processes need by default. Beside four busy processes on two cores they were hardly faster
 than one, and recorders waited twice as long."""
@@ -74,9 +77,10 @@ async def rebuild_memory(
 
     Args:
         url: of an existing memory; events that are recorded during the rebuild are included.
-        workers: the number of processes that fold, each a share of the episodes. On SQLite one of them writes at a
-            time, while the others fold. Each needs a core, and a second to start. None: two for a large log if two
-            cores are idle, otherwise one. Workers are spawned, so a script must call this with more than one below
+        workers: the most processes that fold, each a share of the episodes. On SQLite one of them writes at a time,
+            while the others fold. Each needs a core, and as its start takes longer than folding a small log, there is
+            none for less than 125,000 events or one episode. None: two for a large log if two cores are idle,
+            otherwise one. Workers are spawned, so a script must call this with more than one below
             `if __name__ == "__main__":`.
         views: named queries to create beside the tables, in addition to the registered ones.
         report_progress: called with the number of events done, their total and the current step.
@@ -176,11 +180,12 @@ def _busy_timeout_s(address: DatabaseAddress) -> float:
 
 
 async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, report_progress: ProgressCallback) -> None:
-    _, total = await recorded(log)
+    episodes, total = await recorded(log)
     left = await rebuild.left()
     if workers is None:
         idle = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
         workers = 2 if idle >= _IDLE_CORES_MIN and left > _ALONE_EVENTS_MAX else 1
+    workers = min(workers, episodes, left // _SHARE_EVENTS_MIN)
     done = total - left
 
     def report(count: int) -> None:

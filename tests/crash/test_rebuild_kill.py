@@ -16,6 +16,7 @@ from sqlalchemy import event, func, select
 from sqlalchemy.engine import Engine
 
 from pycrorm_async import Memory, Reading
+from pycrorm_async.operations import rebuild as rebuilding
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpWithContextView, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
@@ -100,6 +101,7 @@ async def test_a_killed_worker_costs_time_and_no_event(database_url: str, monkey
         self.kill()
 
     monkeypatch.setattr(SpawnProcess, "start", start)
+    monkeypatch.setattr(rebuilding, "_SHARE_EVENTS_MIN", 1)
     done = await rebuild_memory(database_url, workers=2)
     assert (done.generation, done.left) == (1002, [])
     assert differences(before, tables_of(database_url)) == []
@@ -159,6 +161,7 @@ _PATIENT = Settings(connect_timeout_s=120, flush_timeout_s=300)
 
 def rebuild_until(url: str, last: int, workers: int, batch_events: int) -> None:
     """Rebuild, and die before statement number `last`; with 0 rebuild to the end and print the count of statements."""
+    rebuilding._SHARE_EVENTS_MIN = 1
     steps._BATCH_EVENTS = batch_events
     count = 0
 

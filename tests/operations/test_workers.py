@@ -18,8 +18,8 @@ import msgspec
 import pytest
 
 from pycrorm_async import Memory, Settings
+from pycrorm_async.operations import rebuild as rebuilding
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.workers import Assignment, DaemonNote, Failure, FoldWorkerState, Write, _RequestHandler
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.custom import Changes, Event, Projection
@@ -262,12 +262,13 @@ if TRAP in os.environ and os.environ[TRAP + "_DAEMON"] != str(os.getpid()):
 
 def rebuild_with_two_workers(url: str, output: str) -> None:
     logging.basicConfig(filename=output, format="%(message)s", level="WARNING")
-    asyncio.run(rebuild_memory(url, workers=2))
+    rebuilding._SHARE_EVENTS_MIN = 1
+    asyncio.run(rebuilding.rebuild_memory(url, workers=2))
 
 
 def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
-    asyncio.run(append_and_fold(url, [*TYPES, *picking(1).records]))
+    asyncio.run(append_and_fold(url, [*TYPES, *picking(1).records, *picking(2).records]))
     before = tables_of(url)
     arguments = (url, f"{tmp_path}/log")
     process = FORKED.Process(target=rebuild_with_two_workers, args=arguments, daemon=True)

@@ -65,7 +65,9 @@ async def every_kind_of_episode(url: str, spool: Path) -> None:
 
 
 @pytest.mark.usefixtures("forked_workers")
-async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: str, tmp_path: Path) -> None:
+async def test_rebuilt_tables_equal_row_for_row_those_folded_live(
+    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     await every_kind_of_episode(database_url, tmp_path / "spool")
     before, stopped, failed = tables_of(database_url), ask(database_url, STOPPED), ask(database_url, FAILED)
     assert len([why for _, _, why in stopped if why]) == 1
@@ -82,6 +84,7 @@ async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: 
     assert ask(database_url, FAILED) == failed
     assert (done.generation, done.left, list(done.parked)) == (1002, [], [str_of(10)])
     assert traces(database_url) == []
+    monkeypatch.setattr(rebuilding, "_SHARE_EVENTS_MIN", 1)
     again = await rebuild_memory(database_url, workers=2, views=[UserView("All", select(TaskTreeNode.id))])
     assert differences(before, tables_of(database_url)) == []
     assert (again.generation, again.left) == (1003, [])
@@ -110,18 +113,25 @@ FAILED = 'SELECT * FROM "Failed" ORDER BY id'
 
 
 @pytest.mark.parametrize(
-    ("events", "cores", "load", "begun"),
+    ("events", "share", "cores", "load", "begun"),
     [
-        (500_000, {0, 1}, 0.0, []),
-        (100, {0, 1}, 0.4, [2]),
-        (100, {0, 1}, 1.0, []),
-        (100, {0}, 0.0, []),
-        pytest.param(100, {0, 1, 2, 3}, 2.4, [2], marks=pytest.mark.soak),
+        (500_000, 50, {0, 1}, 0.0, []),
+        (100, 50, {0, 1}, 0.4, [2]),
+        (100, 60, {0, 1}, 0.4, []),  # 105 events are no two shares
+        (100, 50, {0, 1}, 1.0, []),
+        (100, 50, {0}, 0.0, []),
+        pytest.param(100, 50, {0, 1, 2, 3}, 2.4, [2], marks=pytest.mark.soak),
     ],
 )
 @pytest.mark.usefixtures("forked_workers")
 async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], load: float, begun: list[int]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    events: int,
+    share: int,
+    cores: set[int],
+    load: float,
+    begun: list[int],
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     await append_and_fold(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
@@ -137,6 +147,7 @@ async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
 
     monkeypatch.setattr(rebuilding, "_run_workers", share_out)
     monkeypatch.setattr(rebuilding, "_ALONE_EVENTS_MAX", events)
+    monkeypatch.setattr(rebuilding, "_SHARE_EVENTS_MIN", share)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores)
     monkeypatch.setattr(os, "getloadavg", lambda: (load, 9.0, 9.0))
     assert (await rebuild_memory(url, workers=None)).events == all_events > 100
@@ -146,8 +157,9 @@ async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
 
 @pytest.mark.usefixtures("forked_workers")
 async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(rebuilding, "_SHARE_EVENTS_MIN", 1)
     url = f"sqlite:///{tmp_path}/memory.db"
     episodes = [picking(number, nodes=124).records for number in range(1, 71)]  # two batches for each of two workers
     await append_and_fold(url, [*TYPES, *(record for records in episodes for record in records)])
