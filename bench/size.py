@@ -1,13 +1,15 @@
 """Measure the bytes on disk that a node takes, in the memory of the thesis and in this one.
 
-    python -m bench.size             30,000 nodes, SQLite and PostgreSQL
-    python -m bench.size --quick     300 nodes
+    python -m bench.size             30,000 nodes and 2,000 learned rollouts, SQLite and PostgreSQL
+    python -m bench.size --quick     300 nodes and 100 rollouts
 
 Both sides store one tree of pick-up rollouts (`bench/material`) with the same values: the thesis' memory as rows of its
 tables, this one as events in the log and as the rows that are folded from them. In a SQLite file the pages of each
 table and index are counted (`dbstat`), on PostgreSQL the blocks (`pg_relation_size`). The tables of an empty memory are
-subtracted. The script prints one JSON line: for each database and side bytes a node, for ours also by log and tables,
-rows and indexes apart, and for each table and index that takes at least one byte a node.
+subtracted. A second memory of ours is that of `pycrorm learn`, in which the world, the joints and the failures of a
+robot are recorded, too. The script prints one JSON line: for each database and side bytes a node, for ours also by log
+and tables, rows and indexes apart, for each table and index that takes at least one byte a node, and the bytes of the
+payloads by type of event.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ import argparse
 import json
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -56,8 +60,30 @@ def by_part(sizes_by_name: dict[str, int], nodes: int) -> dict[str, Any]:
     }
 
 
-def measure(new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, with_baseline: bool) -> dict[str, Any]:
-    """Store the tree with both sides and return their bytes a node."""
+def payloads(url: str, nodes: int) -> dict[str, float]:
+    """Return the bytes a node of the payloads of each type of event."""
+    by_type = ask(url, "SELECT type, sum(length(payload)) FROM event GROUP BY type ORDER BY 2 DESC")
+    return {name: round(int(size) / nodes, 1) for name, size in by_type if size >= nodes}
+
+
+def learned(url: str, folder: Path, rollouts: int, empty: dict[str, int]) -> dict[str, Any]:
+    """Learn from rollouts in Bullet and return the bytes a node of their memory."""
+    numbers = {"rollouts": rollouts, "evaluate": rollouts // 5, "held-out": rollouts // 5}
+    files = {"policy": folder / "policy.json", "figure": folder / "policies.png", "url": url}
+    options = [part for name, value in (numbers | files).items() for part in (f"--{name}", str(value))]
+    subprocess.run([sys.executable, "-m", "pycrorm_async", "learn", *options], check=True, stdout=subprocess.DEVNULL)
+    [(nodes,)] = ask(url, "SELECT count(*) FROM event WHERE type = 'NodeStarted'")
+    return {"nodes": nodes, **by_part(_without(empty, sizes(url)), nodes), "payloads": payloads(url, nodes)}
+
+
+def _without(empty: dict[str, int], stored: dict[str, int]) -> dict[str, int]:
+    return {name: size - empty.get(name, 0) for name, size in stored.items()}
+
+
+def measure(
+    new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, with_baseline: bool, rollouts: int = 0
+) -> dict[str, Any]:
+    """Store the tree with both sides, and learn from rollouts if there are any; return the bytes a node."""
     sizes_by_name: list[dict[str, int]] = []
     for name, each in (("empty", Tree([], 1)), ("ours", task_tree)):
         spool = folder / name
@@ -67,8 +93,13 @@ def measure(new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, wit
         store_by_us(url, recorded, spool, events)
         sizes_by_name.append(sizes(url))
     empty, stored = sizes_by_name
-    ours = by_part({name: size - empty.get(name, 0) for name, size in stored.items()}, task_tree.nodes)
-    result: dict[str, Any] = {"ours": ours, "thesis_bytes_a_node": MISSING}
+    result: dict[str, Any] = {
+        "ours": by_part(_without(empty, stored), task_tree.nodes) | {"payloads": payloads(url, task_tree.nodes)},
+        "thesis_bytes_a_node": MISSING,
+        "learned": MISSING,
+    }
+    if rollouts:
+        result["learned"] = learned(new_url("learned"), folder, rollouts, empty)
     if with_baseline:
         url = new_url("thesis")
         run_baseline(url, task_tree.nodes, _SEED)
@@ -78,23 +109,27 @@ def measure(new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, wit
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="300 nodes")
+    parser.add_argument("--quick", action="store_true", help="300 nodes, 100 rollouts")
     parser.add_argument("--nodes", type=int, default=30_000)
+    parser.add_argument("--rollouts", type=int, default=2_000, help="that `pycrorm learn` learns from; 0: leave it out")
     arguments = parser.parse_args()
+    rollouts = (100 if arguments.quick else arguments.rollouts) if find_spec("jpt") is not None else 0
     task_tree = tree(300 if arguments.quick else arguments.nodes, _SEED)
     result: dict[str, Any] = {"bench": "size", "nodes": task_tree.nodes}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
         files = folder / "sqlite"
         files.mkdir()
-        result["sqlite"] = measure(lambda name: f"sqlite:///{files}/{name}.db", task_tree, files, with_baseline=True)
+        result["sqlite"] = measure(
+            lambda name: f"sqlite:///{files}/{name}.db", task_tree, files, with_baseline=True, rollouts=rollouts
+        )
         shutil.rmtree(files)
         server = stack.enter_context(server_in(folder / "pg"))
         servers = folder / "postgresql"
         servers.mkdir()
         has_driver = find_spec("psycopg") is not None
         result["postgresql"] = measure(
-            lambda _name: server.new_database(), task_tree, servers, with_baseline=has_driver
+            lambda _name: server.new_database(), task_tree, servers, with_baseline=has_driver, rollouts=rollouts
         )
     print(json.dumps(result))
 

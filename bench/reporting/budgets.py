@@ -199,6 +199,14 @@ def _size(lines: Lines) -> Verdict:
     return _limits(bytes_a_node, lambda each: f"{each:,}", {"sqlite": 700, "postgresql": 1_000})
 
 
+def _size_learned(lines: Lines) -> Verdict:
+    learned = {database: lines["size"][database].get("learned") for database in DATABASES}
+    bytes_a_node = {name: each["bytes_a_node"] for name, each in learned.items() if isinstance(each, Mapping)}
+    if len(bytes_a_node) < len(learned):
+        return Verdict("not measured: install the extra 'learning'", False)
+    return _limits(bytes_a_node, lambda each: f"{each:,}", {"sqlite": 1_000, "postgresql": 1_400})
+
+
 def _recall_common(lines: Lines) -> Verdict:
     line = _recalled(lines)
     common, soar = line["recall_ms"]["common"]["median"], line["soar"]
@@ -268,6 +276,7 @@ BUDGETS = (
         _start,
     ),
     Budget("disk a node, log and tables", "≤ 700 bytes SQLite, ≤ 1,000 bytes PostgreSQL", _size),
+    Budget("the same of `pycrorm learn`", "≤ 1,000 bytes SQLite, ≤ 1,400 bytes PostgreSQL", _size_learned),
     Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
     Budget(
         "CPU time of `select(Action)`, 25,000 rows, against the system of the thesis",

@@ -111,7 +111,6 @@ class EpisodePage(EpisodeReplay):
         parameters = parameters_text(self.parameters(node))
         texts = [number(each) for each in (node.kind, self.dtype(node), parameters, node.status)]
         self._rows[start] = [start, 0, node.parent or 0, *texts, 0, 0]
-        node.parameters = {}  # the page has them as text
 
     def _end_row(self, sequence: int, start: int) -> None:
         node = self.nodes[start]
@@ -119,6 +118,7 @@ class EpisodePage(EpisodeReplay):
         texts = [self._texts.number(each or "") for each in (node.status, node.reason, node.message)]
         self._rows[start] = [start, end, *self._rows[start][2:6], *texts]
         self._ended_nodes[start] = sequence
+        node.parameters = {}  # the page has them as text, and no node inside it starts any more
 
     def _observed(self, sequence: int, observed: event_types.Observed) -> None:
         text = msgspec.json.encode(observed.values).decode()
