@@ -7,9 +7,10 @@ import math
 import os
 import random
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from pycrorm_async import __version__
@@ -17,6 +18,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.events.types import (
+    BriefPose,
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
@@ -26,6 +28,7 @@ from pycrorm_async.events.types import (
     NodeStarted,
     ObjectAdded,
     ObjectReference,
+    PoseReference,
     PoseValue,
     RobotValue,
 )
@@ -329,8 +332,18 @@ class Recording:
         self._put(NodeEnded(self.root, "SUCCEEDED"))
         self._put(EpisodeEnded("SUCCEEDED"))
 
-    def put_tree(self, node: Node, parent: int, *, after: Callable[[], None] | None = None) -> None:
-        """Put this node and its descendants; `after` is called after the end of each node."""
+    def put_tree(
+        self,
+        node: Node,
+        parent: int,
+        *,
+        after: Callable[[], None] | None = None,
+        places: Mapping[Place, PoseReference] = MappingProxyType({}),
+    ) -> None:
+        """Put this node and its descendants; `after` is called after the end of each node.
+
+        `places` are those in parameters of the nodes around, which are named.
+        """
         declared = DECLARED[node.dtype]
         self._now_ns = node.start_ns
         sequence = self._put(
@@ -338,12 +351,18 @@ class Recording:
                 declared.declaration.kind,
                 parent,
                 declared.fingerprint,
-                {name: self._written(value) for name, value in node.values.items()},
+                {name: self._written(value, places) for name, value in node.values.items()},
                 _robot(node.robot),
             )
         )
+        slots = {each.name: each.slot for each in declared.declaration.fields}
+        own = {
+            value: PoseReference(sequence, name, slots[name])
+            for name, value in node.values.items()
+            if isinstance(value, Place) and value not in places
+        }
         for child in node.children:
-            self.put_tree(child, sequence, after=after)
+            self.put_tree(child, sequence, after=after, places={**places, **own})
         self._now_ns = node.end_ns
         failure = FailureValue(node.failure, "") if node.failure else None
         self._put(NodeEnded(sequence, "FAILED" if failure else "SUCCEEDED", failure))
@@ -363,10 +382,10 @@ class Recording:
     def _episode_writer(self, name: EpisodeId) -> EpisodeWriter:
         return EpisodeWriter(self._emitter, name, EpisodeOpening("rollouts", "bench"))
 
-    def _written(self, value: object) -> Any:
+    def _written(self, value: object, places: Mapping[Place, PoseReference]) -> Any:
         match value:
             case Place():
-                return _pose(value)
+                return places.get(value) or _pose(value)
             case WorldObject():
                 return self._milk
             case _:
@@ -378,4 +397,4 @@ def _pose(place: Place) -> PoseValue:
 
 
 def _robot(robot: Robot | None) -> RobotValue | None:
-    return RobotValue(_pose(robot.place), "ROBOT", robot.torso_m) if robot is not None else None
+    return RobotValue(BriefPose.of(_pose(robot.place)), "ROBOT", robot.torso_m) if robot is not None else None

@@ -11,6 +11,8 @@ import hashlib
 import re
 import zlib
 from base64 import b64decode
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import msgspec
@@ -58,6 +60,43 @@ class PoseValue(_Value, frozen=True, omit_defaults=False):
     orientation: tuple[float, float, float, float] = UPRIGHT
     frame: str = MAP
     time_ns: int = 0
+
+
+class PoseReference(_Value, frozen=True):
+    """A parameter whose pose is that of a node around its own, as the target of a motion is that of its action.
+
+    Attributes:
+        pose_of: the sequence of that node's NodeStarted, which has the pose itself.
+        field: the key of its parameter.
+        slot: that of the field.
+    """
+
+    pose_of: int
+    field: str
+    slot: int
+
+    @classmethod
+    def of(cls, value: Any) -> PoseReference | None:
+        """Return the reference that a parameter is; None if it is none."""
+        if not isinstance(value, dict) or value.keys() != {"pose_of", "field", "slot"}:
+            return None
+        with suppress(msgspec.ValidationError):
+            return msgspec.convert(value, cls)
+        return None
+
+
+def with_poses(parameters: Mapping[str, Any], of_node: Callable[[int], Mapping[str, Any] | None]) -> dict[str, Any]:
+    """Return parameters with the poses that they refer to; `of_node` returns those of a node, None for an unknown one.
+
+    >>> named = {"target": {"pose_of": 4, "field": "place", "slot": 2}}
+    >>> with_poses(named, {4: {"place": {"position": [1, 0, 0]}}}.get)
+    {'target': {'position': [1, 0, 0]}}
+    """
+    whole = dict(parameters)
+    for name, value in parameters.items():
+        if (reference := PoseReference.of(value)) is not None:
+            whole[name] = (of_node(reference.pose_of) or {}).get(reference.field, value)
+    return whole
 
 
 class BriefPose(PoseValue, frozen=True, omit_defaults=True):
@@ -476,8 +515,8 @@ class NodeStarted(Happening, frozen=True):
         parent: the parent's sequence; None for the root.
         designator: fingerprint of the `DesignatorTypeDeclared`; None for the root, and if its class cannot be declared.
         parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
-            poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
-            `MissingValue` for a value that cannot be recorded and for a field that the declaration omits.
+            poses as `PoseValue` or `PoseReference`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of
+            these; a `MissingValue` for a value that cannot be recorded and for a field that the declaration omits.
         robot: the robot's state at this moment; None if there is no robot.
         simulated: whether the node is part of a simulation; the same for all nodes of an episode.
         continues: in a follow-up episode, the sequence that the continued node had in the former episode.

@@ -21,7 +21,7 @@ from typing import Any
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, TablesPending
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded, with_poses
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.frames import TRIED
@@ -425,6 +425,8 @@ class Activity:
         self._nodes = self._failed = 0
         self._parents: dict[int, int | None] = {}
         self._running: dict[int, str] = {}
+        self._parameters: dict[int, dict[str, Any]] = {}
+        """The parameters of the nodes that run, to which those of nodes inside them may refer."""
         self._actions: dict[int, str] = {}
         """The types of the running nodes that are actions."""
         self._tries: dict[str, list[int]] = {}
@@ -455,7 +457,8 @@ class Activity:
             case NodeStarted() as started:
                 self._nodes += 1
                 dtype = designators.get(started.designator or "", "")
-                parameters = with_object_names(started.parameters, lambda each: self._names.get(each["object"]))
+                self._parameters[event.sequence] = whole = with_poses(started.parameters, self._parameters.get)
+                parameters = with_object_names(whole, lambda each: self._names.get(each["object"]))
                 self._parents[event.sequence] = started.parent
                 if started.kind == "action":
                     self._actions[event.sequence] = dtype
@@ -471,11 +474,13 @@ class Activity:
                 if ended_episode.status == "LOST":
                     self._failed += len(self._running)
                 self._running.clear()
+                self._parameters.clear()
             case _:
                 pass
 
     def _node_ended(self, ended: NodeEnded) -> None:
         text = self._running.pop(ended.node, "")
+        self._parameters.pop(ended.node, None)
         self._latest = text if ended.node in self._actions else self._latest
         if (dtype := self._actions.pop(ended.node, None)) is not None and ended.status in _TRIED:
             tries = self._tries.setdefault(dtype, [0, 0])

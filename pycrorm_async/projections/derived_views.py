@@ -244,16 +244,26 @@ def member(document: sa.ColumnElement[Any], name: str) -> sa.ColumnElement[str]:
 _STARTED_BY: Final = (
     f"event.episode = ({{row}}.id >> {_NUMBER_BITS}) AND event.sequence = ({{row}}.id >> {_SLOT_BITS}) & {SEQUENCE_MAX}"
 )
-_PARAMETERS_SQLITE: Final = (
-    "(SELECT CASE WHEN json_valid(payload) THEN json_extract(payload, '$.parameters') END"  # noqa: S608
-    f" FROM event WHERE {_STARTED_BY})"
-)
-_PARAMETERS_POSTGRESQL: Final = (
-    "(SELECT CASE WHEN payload LIKE '{{%}}' THEN CAST(CAST(payload AS json) -> 'parameters' AS text) END"  # noqa: S608
-    f" FROM event WHERE {_STARTED_BY})"
-)
-"""The parameters of the node in `row`, as recorded; null where the event is damaged. Their key has one place in all
-versions of the event."""
+_POSE_OF: Final = '"pose_of":'
+_PARAMETERS_SQLITE: Final = f"""(SELECT CASE WHEN json_valid(payload) AND instr(payload, '{_POSE_OF}') THEN (
+ SELECT json_group_object(part.key, json(coalesce((
+   SELECT named.payload -> ('$.parameters."' || json_extract(part.value, '$.field') || '"') FROM event AS named
+   WHERE named.episode = event.episode
+    AND named.sequence = CASE WHEN part.type = 'object' THEN json_extract(part.value, '$.pose_of') END),
+  event.payload -> part.fullkey))) FROM json_each(event.payload, '$.parameters') AS part)
+ WHEN json_valid(payload) THEN json_extract(payload, '$.parameters') END
+ FROM event WHERE {_STARTED_BY})"""  # noqa: S608
+_PARAMETERS_POSTGRESQL: Final = f"""(SELECT CASE WHEN payload NOT LIKE '{{{{%}}}}' THEN NULL
+ WHEN strpos(payload, '{_POSE_OF}') > 0 THEN (
+  SELECT '{{{{' || string_agg(CAST(to_json(part.key) AS text) || ':' || CAST(coalesce((
+    SELECT CAST(named.payload AS json) -> 'parameters' -> (part.value ->> 'field') FROM event AS named
+    WHERE named.episode = event.episode AND named.sequence =
+     CASE WHEN json_typeof(part.value) = 'object' THEN CAST(part.value ->> 'pose_of' AS bigint) END),
+   part.value) AS text), ',') || '}}}}' FROM json_each(CAST(event.payload AS json) -> 'parameters') AS part)
+ ELSE CAST(CAST(payload AS json) -> 'parameters' AS text) END
+ FROM event WHERE {_STARTED_BY})"""  # noqa: S608
+"""The parameters of the node in `row`, as recorded, with the poses that they name in other events; null where the event
+is damaged. Their key has one place in all versions of the event."""
 
 
 def parameters_of(nodes: NamedFromClause) -> sa.ColumnElement[str]:

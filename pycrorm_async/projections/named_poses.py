@@ -1,13 +1,14 @@
-"""Give the start of a node the pose of its robot again, which the log has only in the row that the event names.
+"""Give the start of a node the poses again that the log has only in other events, which the event names.
 
 The tables need no pose: the id of its row follows from the event. A custom projection gets the event as it was before
-it was written. The poses that a batch names are in events of the batch or before it; those before it are looked up in
-the log, one primary key each, so that a projection without a state needs none.
+it was written. The events that a batch names are in the batch or before it; those before it are looked up in the log by
+primary key, so that a projection without a state needs none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -18,7 +19,7 @@ from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-_PLACING = frozenset({"ObjectAdded", "ObjectMoved"})
+_NAMED = frozenset({"ObjectAdded", "ObjectMoved", "NodeStarted"})
 
 
 class _Row(msgspec.Struct):
@@ -27,57 +28,73 @@ class _Row(msgspec.Struct):
 
 class _Robot(msgspec.Struct):
     object: _Row | None = None
-    pose: msgspec.Raw | None = None
+    pose: Any = None
 
 
 class _Start(msgspec.Struct):
-    """The part of a NodeStarted that names a row."""
+    """The parts of a NodeStarted that name other events."""
 
     robot: _Robot | None = None
+    parameters: dict[str, Any] = {}
 
 
 _start = msgspec.json.Decoder(_Start)
 
 
 class NamedPoses:
-    """The poses of objects in the events that were noted, by episode and sequence."""
+    """The events that may be named, by episode and sequence, among those that were noted."""
 
     def __init__(self) -> None:
-        self._poses: dict[tuple[int, int], event_types.PoseValue] = {}
+        self._events: dict[tuple[int, int], StoredEvent] = {}
 
     def note(self, events: Sequence[StoredEvent]) -> None:
-        """Note the poses in these events. One that cannot be read has none; the fold refuses it."""
+        """Note these events."""
         for event in events:
-            key = event.number, event.sequence
-            if event.type in _PLACING and key not in self._poses:
-                try:
-                    placing = happening_of(event)
-                except CannotFold:
-                    continue
-                assert isinstance(placing, event_types.ObjectAdded | event_types.ObjectMoved)
-                self._poses[key] = placing.pose
+            if event.type in _NAMED:
+                self._events[event.number, event.sequence] = event
 
     async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
-        """Note the poses in these events, and those that they name."""
+        """Note these events, and those that they name."""
         self.note(events)
-        named = {(event.number, row) for event in events if (row := _row_named_by(event)) is not None}
-        missing = sorted(named - self._poses.keys())
-        if missing:
-            self.note(await log.spans([Span(number, row - 1, row) for number, row in missing]))
+        named = {(event.number, sequence) for event in events for sequence in _named_by(event)}
+        if missing := sorted(named - self._events.keys()):
+            self.note(await log.spans([Span(number, sequence - 1, sequence) for number, sequence in missing]))
 
     def whole(self, number: int, started: event_types.NodeStarted) -> event_types.NodeStarted:
-        """Return the start of a node with its robot's pose."""
+        """Return the start of a node with the poses that it names."""
         robot = started.robot
-        if robot is None or robot.pose is not None or robot.object is None:
-            return started
-        return replace(started, robot=replace(robot, pose=self._poses.get((number, robot.object.row))))
+        if robot is not None and robot.pose is None and robot.object is not None:
+            placing = self._named(number, robot.object.row)
+            if isinstance(placing, event_types.ObjectAdded | event_types.ObjectMoved):
+                started = replace(started, robot=replace(robot, pose=placing.pose))
+        if any(map(event_types.PoseReference.of, started.parameters.values())):
+            parameters = event_types.with_poses(started.parameters, lambda node: self._parameters_of(number, node))
+            started = replace(started, parameters=parameters)
+        return started
+
+    def _parameters_of(self, number: int, node: int) -> Mapping[str, Any] | None:
+        started = self._named(number, node)
+        return started.parameters if isinstance(started, event_types.NodeStarted) else None
+
+    def _named(self, number: int, sequence: int) -> event_types.Happening | None:
+        event = self._events.get((number, sequence))
+        try:
+            return happening_of(event) if event is not None else None
+        except CannotFold:  # its own fold refuses it
+            return None
 
 
-def _row_named_by(event: StoredEvent) -> int | None:
-    if event.type != "NodeStarted" or b'"robot"' not in event.payload:
-        return None
+def _named_by(event: StoredEvent) -> Iterator[int]:
+    """Yield the sequences of the events that this one names."""
+    if event.type != "NodeStarted" or not (b'"robot"' in event.payload or b'"pose_of"' in event.payload):
+        return
     try:
-        robot = _start.decode(event.payload).robot
+        started = _start.decode(event.payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):  # the fold refuses the event
-        return None
-    return robot.object.row if robot is not None and robot.pose is None and robot.object is not None else None
+        return
+    robot = started.robot
+    if robot is not None and robot.pose is None and robot.object is not None:
+        yield robot.object.row
+    for value in started.parameters.values():
+        if (reference := event_types.PoseReference.of(value)) is not None:
+            yield reference.pose_of

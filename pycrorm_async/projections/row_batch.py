@@ -25,6 +25,7 @@ from pycrorm_async.events.types import (
     ObjectReference,
     ObjectValue,
     Observed,
+    PoseReference,
     PoseValue,
 )
 from pycrorm_async.projections.columns import COLUMNS, EPISODE, Union
@@ -376,6 +377,8 @@ def _scalar(_event: StoredEvent, _node: int, field: FieldDeclared, value: Any, _
 
 
 def _pose(event: StoredEvent, node: int, field: FieldDeclared, value: Any, others: ParameterRows) -> int:
+    if (reference := PoseReference.of(value)) is not None:
+        return in_slot(row_of(event.number, reference.pose_of), reference.slot)
     pose = pose_of(field, value)
     own = in_slot(node, field.slot)
     others.append(("pose", pose_row(own, event.number, pose)))

@@ -235,9 +235,16 @@ class EpisodeReplay:
         parent = started.parent
         if self._strict and parent is not None and parent not in self.nodes:
             raise CannotFold(f"its parent {parent} never started")
+        parameters = started.parameters
+        if b'"pose_of"' in event.payload:
+            parameters = event_types.with_poses(parameters, self._parameters_of)
         self.nodes[event.sequence] = ReplayedNode(
-            started.kind, parent, started.designator, started.parameters, started.simulated, event.wall_ns, at
+            started.kind, parent, started.designator, parameters, started.simulated, event.wall_ns, at
         )
+
+    def _parameters_of(self, sequence: int) -> Mapping[str, Any] | None:
+        node = self.nodes.get(sequence)
+        return node.parameters if node is not None else None
 
     def _end(self, at: EventTime, ended: event_types.NodeEnded) -> None:
         if (node := self.nodes.get(ended.node)) is None:

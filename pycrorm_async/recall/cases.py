@@ -283,7 +283,7 @@ def _add_robot(
     if stands is None:
         return
     for name, features in fields.poses:
-        if (value := parameters.get(name)) is not None and value["frame"] == stands.frame:
+        if (value := parameters.get(name)) is not None and value.get("frame") == stands.frame:
             x, y, z, yaw = features
             numbers[x], numbers[y], numbers[z], numbers[yaw] = _pose_in(value["position"], value["orientation"], stands)
 
@@ -408,6 +408,7 @@ class _Action:
     Attributes:
         node: id of its node.
         scope: the nearest action around it; None outside any.
+        poses: its parameters that are poses, to which those of nodes inside it may refer.
         after: type and status of the action that ended last inside it.
     """
 
@@ -419,6 +420,7 @@ class _Action:
     symbols: Symbols
     numbers: Numbers
     simulated: bool
+    poses: Mapping[str, Any]
     after: tuple[str, str] | None = None
     has_ended: bool = False
 
@@ -500,6 +502,8 @@ class EpisodeCases:
         parameters = started.parameters
         if b'"missing"' in payload:
             parameters = {name: each for name, each in parameters.items() if not is_missing(each)}
+        if b'"pose_of"' in payload:
+            parameters = event_types.with_poses(parameters, self._poses_of)
         symbols, numbers = situation(fields, parameters, started.robot, self._world)
         after = self._after
         if scope is not None:
@@ -520,7 +524,12 @@ class EpisodeCases:
             symbols,
             numbers,
             simulated,
+            {name: parameters[name] for name, _ in fields.poses if name in parameters},
         )
+
+    def _poses_of(self, sequence: int) -> Mapping[str, Any] | None:
+        action = self._running.get(sequence)
+        return action.poses if action is not None else None
 
     def _end(self, action: _Action, ended: event_types.NodeEnded, monotonic_ns: int) -> Case:
         status, failure = ended.status, ended.failure

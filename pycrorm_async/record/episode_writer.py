@@ -151,7 +151,7 @@ class EpisodeWriter:
         *,
         may_refuse: bool = False,
         reserved: bool = True,
-        robot: ActingRobot | None = None,
+        shown: Mapping[str, Any] = {},
     ) -> int:
         """Append an event and return its sequence. Parts that cannot be recorded are left out, and counted.
 
@@ -159,15 +159,17 @@ class EpisodeWriter:
             owner: the type whose values are counted as missing; by default that of the event.
             may_refuse: raise `Unrecordable` for a missing parameter, if the settings ask for it.
             reserved: use the spool's reserve, and block when that is used up; otherwise raise `SpoolFull`.
-            robot: of the start of a node, to be published with the whole state of the robot.
+            shown: for observers, the whole of fields that name what another event has.
         """
-        emitter, kind = self.emitter, type(event)
+        emitter, kind, given = self.emitter, type(event), event
         try:
             payload = encode(event, bytes_max=emitter.record_bytes_max)
         except NotEncodable:
             event, reasons = fitted(event, emitter.record_bytes_max)
             emitter.note_missing(owner or kind.__name__, reasons, may_refuse=may_refuse)
             payload = encode(event, bytes_max=emitter.record_bytes_max)
+            if isinstance(given, NodeStarted) and isinstance(event, NodeStarted):
+                given.parameters.update(event.parameters)  # so that the caller sees what was left out
         heading = self._headings.get(kind)
         if heading is None:
             heading = self._headings[kind] = Heading(self.id, kind.__name__, kind.version)
@@ -181,9 +183,8 @@ class EpisodeWriter:
             sequence = emitter.put_payload(heading, payload, at=self.time, after=self._stored)
         self._stored = 0  # the queue has the episode's sequence from now on
         if emitter.feed.observers:
-            if robot is not None and isinstance(event, NodeStarted) and event.robot is not None:
-                event = replace(event, robot=robot.state)
-            emitter.feed.publish(self.id, sequence, event)
+            whole = {name: each for name, each in shown.items() if getattr(event, name) is getattr(given, name)}
+            emitter.feed.publish(self.id, sequence, replace(event, **whole) if whole else event)
         return sequence
 
     def _stored_before(self, heading: Heading, payload: bytes) -> int:
@@ -242,18 +243,23 @@ class EpisodeWriter:
         robot: ActingRobot | None,
         missing: Mapping[str, str],
         *,
+        named: dict[str, Any] | None = None,
         may_refuse: bool = False,
     ) -> int:
         """Write the start of a node and return its sequence. `missing` has the reason for each missing value.
 
-        Raises `Unrecordable` if `may_refuse` and the settings ask for it.
+        `named` are the parameters with references to the poses that nodes around have. Raises `Unrecordable` if
+        `may_refuse` and the settings ask for it.
         """
         owner = declared.dtype
         if missing:
             self.emitter.note_missing(owner, missing, may_refuse=may_refuse)
         written = cast("RobotValue", robot.written) if robot is not None else None
-        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, written, self.simulated)
-        sequence = self.put(event, owner, may_refuse=may_refuse, robot=robot)
+        event = NodeStarted(kind, parent, declared.fingerprint or None, named or parameters, written, self.simulated)
+        shown: dict[str, Any] = {} if robot is None else {"robot": robot.state}
+        if named is not None:
+            shown["parameters"] = parameters
+        sequence = self.put(event, owner, may_refuse=may_refuse, shown=shown)
         self._open[sequence] = owner
         return sequence
 

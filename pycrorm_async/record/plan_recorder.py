@@ -21,11 +21,11 @@ from __future__ import annotations
 import inspect
 import math
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
 from functools import partial, wraps
-from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import (
@@ -51,6 +51,8 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectReference,
+    PoseReference,
+    PoseValue,
     RefusalValue,
     RobotValue,
     SeenValue,
@@ -83,6 +85,11 @@ current_episode: ContextVar[Episode | None] = ContextVar("current_episode", defa
 """The innermost episode opened in this context; it may be closed already."""
 
 
+KnownPoses: TypeAlias = tuple[tuple[PoseValue, PoseReference], ...]
+_POSES_MAX: Final = 8
+"""Bounds the poses of nodes around that a parameter is compared with: those of four levels, of two poses each."""
+
+
 class NodeRecord(NamedTuple):
     """The hooks' record of a running node, kept as `TaskTreeNode.record`.
 
@@ -91,12 +98,14 @@ class NodeRecord(NamedTuple):
         sequence: sequence of the node's NodeStarted; its id.
         implicit: whether the episode was opened for this node alone and ends with it.
         outer_episode: the current episode of the context before the node started.
+        poses: the poses in parameters of this node and of those around it, each with a reference to it.
     """
 
     episode: Episode
     sequence: int
     implicit: bool
     outer_episode: Episode | None
+    poses: KnownPoses = ()
 
 
 class Episode(EpisodeWriter):
@@ -200,6 +209,8 @@ class Recorder:
         self._declarations = Declarations(recording.known_types, strict=self._strict)
         self._sampler = _sampler_of(emitter)
         self._kept: set[tuple[str, str]] = set()
+        self._pose_fields: dict[type, tuple[tuple[str, int], ...]] = {}
+        """Name and slot of the fields of each type that are poses."""
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "__dtype__", "it")))
         """Performs called outside any episode."""
 
@@ -308,9 +319,20 @@ class Recorder:
             missing: dict[str, str] = {}
             parameters = read_parameters(designator, declared.fields, episode, missing)
             robot = episode.robot_state() if episode.world is not None else None
+            parent: NodeRecord | None = node.parent.record if node.parent is not None else None
+            poses = parent.poses if parent is not None and parent.episode is episode else ()
+            fields = self._pose_fields.get(kind)
+            if fields is None:
+                fields = self._pose_fields[kind] = tuple(
+                    (each.name, each.slot) for each in declared.declaration.fields if each.type == "pose"
+                )
+            named = _with_references(parameters, fields, poses) if fields and poses else None
+            above = episode.node_or_root(node.parent)
             sequence = episode.put_start(
-                declared, node.kind, episode.node_or_root(node.parent), parameters, robot, missing, may_refuse=True
+                declared, node.kind, above, parameters, robot, missing, named=named, may_refuse=True
             )
+            if fields:
+                poses = (*poses, *_poses_in(named or parameters, fields, sequence, missing))[-_POSES_MAX:]
         except BaseException as error:
             if implicit is not None:
                 self.close_episode(implicit, error)
@@ -318,7 +340,7 @@ class Recorder:
                 raise
             emitter.note_fault("NodeStarted", error)  # a fault of the memory must not reach a plan
             return
-        node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode)
+        node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode, poses)
         if implicit is not None:
             current_episode.set(implicit)
         if declared.fault is not None:
@@ -446,6 +468,30 @@ class Recorder:
             raise
         except Exception as error:  # noqa: BLE001  counted
             self._emitter.note_fault(event_type, error)
+
+
+def _with_references(
+    parameters: dict[str, Any], fields: tuple[tuple[str, int], ...], poses: KnownPoses
+) -> dict[str, Any] | None:
+    """Return the parameters with references to the known poses among them; None if there are none."""
+    named: dict[str, Any] = {}
+    for name, _ in fields:
+        pose = parameters.get(name)
+        for known, reference in poses:
+            if known == pose:
+                named[name] = reference
+                break
+    return parameters | named if named else None
+
+
+def _poses_in(
+    parameters: Mapping[str, Any], fields: tuple[tuple[str, int], ...], node: int, missing: Mapping[str, str]
+) -> Iterator[tuple[PoseValue, PoseReference]]:
+    """Yield the poses that this node was written with, each with a reference to it."""
+    for name, slot in fields:
+        pose = parameters.get(name)
+        if isinstance(pose, PoseValue) and name not in missing:
+            yield pose, PoseReference(node, name, slot)
 
 
 def observing() -> Recorder | None:

@@ -171,6 +171,7 @@ def test_the_golden_bytes_of_the_second_version_decode_to_the_documented_values(
     events = [decode(kind, payload.encode(), 2) for kind, _, payload in lines]
     upright = (0.0, 0.0, 0.0, 1.0)
     target = {"target": {"position": [1.0, 0.0, 0.0], "orientation": [*upright], "frame": "map", "time_ns": 7}}
+    named = {"target": {"pose_of": 9, "field": "target_location", "slot": 2}}
     standing = RobotValue(None, "ROBOT", 0.25, ObjectReference(3, 8), "pr2")
     offered = (CandidateValue(PoseValue((1.0, 2.0, 0.0), upright, "map", 4), ("LEFT",)),)
     refused = (RefusalValue(PoseValue((2.0, 2.0, 0.0), upright, "map", 4), "occupied"),)
@@ -179,6 +180,7 @@ def test_the_golden_bytes_of_the_second_version_decode_to_the_documented_values(
         ObjectMoved(3, "pr2", "ROBOT", PoseValue((0.5, 0.0, 0.0), (0.0, 0.0, 0.6, 0.8), "map", 6), 9),
         NodeStarted("action", 2, "00112233445566778899aabbccddeeff", target, standing),
         NodeStarted("motion", robot=RobotValue(PoseValue((1.0, 2.0, 0.0), upright, "odom", 5), "BASE")),
+        NodeStarted("motion", 9, "00112233445566778899aabbccddeeff", named),
         LocationResolved("CostmapLocation", offered, 0, 2, refused=refused),
         ObjectDetected("camera", seen=(SeenValue("cup", "JEROEN_CUP", PoseValue((1.0, 2.0, 0.5), upright, "map", 5)),)),
     ]

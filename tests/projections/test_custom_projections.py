@@ -16,11 +16,13 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
     EpisodeStarted,
+    EpisodeTagged,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
     ObjectReference,
+    PoseReference,
     RobotValue,
 )
 from pycrorm_async.memory import Memory
@@ -40,6 +42,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import share_out
 from tests.commands import FORKED, fork
 from tests.projections.event_script import (
+    MOVE,
     PICK_UP,
     SAYING,
     Script,
@@ -130,14 +133,15 @@ async def rebuilt(log: EventLog, projection: Projection) -> None:
 
 class Stands(Projection):
     name, version = "stands", 1
-    tables = {"stand": {"x": "real"}}  # noqa: RUF012 - a common form in user code
+    tables = {"stand": {"x": "real", "target": "json"}}  # noqa: RUF012 - a common form in user code
     reads = (NodeStarted,)
 
     def fold(self, event: Event, rows: Changes) -> None:
         assert isinstance(event.happening, NodeStarted)
         if event.happening.robot is not None:
             assert event.happening.robot.pose is not None
-            rows.insert("stand", event.id, x=event.happening.robot.pose.position[0])
+            x, target = event.happening.robot.pose.position[0], event.parameters.get("target")
+            rows.insert("stand", event.id, x=x, target=target and target["position"])
 
 
 class NoLeftHand(GraspRate):
@@ -557,8 +561,14 @@ async def test_a_projection_gets_the_pose_of_the_robot_that_a_node_names_by_a_ro
         state = RobotValue(None, "ROBOT", 0.25, ObjectReference(robot, row_of_robot), "pr2")
         nodes.append(script.put(NodeStarted("action", root, name_of(SAYING), {"text": "hi"}, state)))
     nodes.append(script.put(NodeStarted("action", root, name_of(SAYING), {}, RobotValue(pose(9.5), "ROBOT"))))
-    await folded(log, [*declarations(SAYING), *script.records], Stands(), batch_events=batch_events)
-    rows = [(row(node), x) for node, x in zip(nodes, (0.5, 1.5, 1.5, 2.5, 9.5), strict=True)]
+    go = script.put(NodeStarted("action", root, name_of(MOVE), {"target": pose(7, 8)}, RobotValue(pose(3))))
+    script.put(EpisodeTagged(("far",)))
+    named = {"target": PoseReference(go, "target", 2)}
+    nodes += [go, script.put(NodeStarted("action", go, name_of(MOVE), named, RobotValue(pose(4))))]
+    await folded(log, [*declarations(SAYING, MOVE), *script.records], Stands(), batch_events=batch_events)
+    rows = [(row(node), x) for node, x in zip(nodes, (0.5, 1.5, 1.5, 2.5, 9.5, 3, 4), strict=True)]
     assert await ask(log, "SELECT id, x FROM stand ORDER BY id") == rows
+    targets = await ask(log, "SELECT target FROM stand WHERE x > 2.6 AND x < 5 ORDER BY id")
+    assert targets == [("[7,8,0.0]",)] * 2
     result = await verify(log, projections=[Stands()])
     assert (result.drift, result.damage, result.not_compared) == (0, 0, {})

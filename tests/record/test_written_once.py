@@ -18,8 +18,10 @@ from pycrorm_async.events.types import (
     Happening,
     NodeStarted,
     ObjectReference,
+    PoseReference,
     PoseValue,
     RobotValue,
+    with_poses,
 )
 from pycrorm_async.plan import PlanFailure
 from pycrorm_async.plan.actions import (
@@ -62,6 +64,9 @@ async def _recorded() -> tuple[RecorderCase, list[Happening]]:
 
 def _as_first_version(case: RecorderCase, event: Happening) -> tuple[str, bytes]:
     """Return an event as it was written before: every pose at each place, with all fields."""
+    if isinstance(event, NodeStarted):
+        starts = {sequence: each for sequence, each in case.sink.only() if isinstance(each, NodeStarted)}
+        event = replace(event, parameters=with_poses(event.parameters, lambda node: starts[node].parameters))
     if isinstance(event, NodeStarted) and event.robot is not None:
         (episode,) = case.sink.sequences
         pose, name = case.sink.robot_pose(episode, event), "".join(("RO", "BOT"))  # not the default itself, so written
@@ -92,7 +97,12 @@ async def test_the_tables_of_poses_that_are_named_are_those_of_poses_written_at_
     before, after = _folded(case, first), _folded(case, today)
     poses_before, poses_after = before.pop("pose"), after.pop("pose")
     nodes_before, nodes_after = before.pop("task_tree_node"), after.pop("task_tree_node")
-    assert after == before
+    references = [each for start in events if isinstance(start, NodeStarted) for each in start.parameters.values()]
+    assert sum(PoseReference.of(each) is not None for each in references) == 3  # of the motions of three navigations
+    moved = {key: (*each[:2], before["move_motion"][key][2]) for key, each in after["move_motion"].items()}
+    targets = [poses_after[each[2],][1:] for each in after["move_motion"].values()]
+    assert targets == [poses_before[each[2],][1:] for each in before["move_motion"].values()]
+    assert after | {"move_motion": moved} == before
     assert poses_after.items() < poses_before.items()
     assert nodes_after.keys() == nodes_before.keys()
     for key, node in nodes_after.items():

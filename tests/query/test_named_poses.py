@@ -1,0 +1,111 @@
+"""Every reader shows the pose of a parameter that the log has in the event of a node around it."""
+
+from __future__ import annotations
+
+import json
+
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    NodeEnded,
+    NodeStarted,
+    PoseReference,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.live.follower import Activity
+from pycrorm_async.projections.fold import happening_of
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.text import parameters_text
+from pycrorm_async.recall.cases import EpisodeCases
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow
+from tests.projections.event_script import (
+    MOVE,
+    NAVIGATE,
+    T0_NS,
+    Script,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+    row,
+)
+from tests.projections.sql_queries import ask
+
+GO = declared("GoAction", "go_action", field("place", "pose", 2), field("arm", "enum", 3))
+PLACE = {"position": [1.0, 2.0, 0.0], "orientation": [0.0, 0.0, 0.0, 1.0], "frame": "map", "time_ns": T0_NS - 1_000_007}
+OTHER = PoseValue((0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 5)
+
+
+def _script() -> Script:
+    """An action goes to a place by another action, whose motion and its own have other targets."""
+    script, robot = Script(), RobotValue(pose())
+    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(NodeStarted("root"))
+    go = script.put(NodeStarted("action", root, name_of(GO), {"place": pose(1, 2), "arm": "LEFT"}, robot))
+    named = PoseReference(go, "place", 2)
+    navigate = script.put(NodeStarted("action", go, name_of(NAVIGATE), {"target_location": named}, robot))
+    for target in (named, OTHER):
+        motion = script.put(NodeStarted("motion", navigate, name_of(MOVE), {"target": target}))
+        script.put(NodeEnded(motion, "SUCCEEDED"))
+    for node in (navigate, go, root):
+        script.put(NodeEnded(node, "SUCCEEDED"))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
+async def test_views_have_the_parameters_with_the_pose_and_the_tables_have_one_row_of_it(log: EventLog) -> None:
+    projector = Projector(log)
+    await projector.open()
+    await log.append([*declarations(GO, NAVIGATE, MOVE), *_script().records])
+    await projector.catch_up()
+    rows = await ask(log, "SELECT id, parameters FROM designator ORDER BY id")
+    assert [(key, json.loads(text)) for key, text in rows] == [
+        (row(3), {"place": PLACE, "arm": "LEFT"}),
+        (row(4), {"target_location": PLACE}),
+        (row(5), {"target": PLACE}),
+        (row(7), {"target": {**PLACE, "position": [0.5, 0.0, 0.0], "time_ns": 5}}),
+    ]
+    text = dict(await ask(log, "SELECT dtype, parameters FROM action"))["GoAction"]
+    assert (text[:10], text.endswith(',"arm":"LEFT"}')) == ('{"place":{', True)  # the order and the form as recorded
+    assert await ask(log, "SELECT target_id FROM move_motion ORDER BY id") == [(row(3, 2),), (row(7, 2),)]
+    assert await ask(log, "SELECT target_location_id FROM navigate_action") == [(row(3, 2),)]
+    poses = await ask(log, "SELECT id, x, y FROM pose WHERE x > 0 ORDER BY id")
+    assert poses == [(row(3, 2), 1.0, 2.0), (row(7, 2), 0.5, 0.0)]
+
+
+async def test_a_moment_of_the_episode_has_the_pose(log: EventLog) -> None:
+    projector = Projector(log)
+    await projector.open()
+    await log.append([*declarations(GO, NAVIGATE, MOVE), *_script().records])
+    await projector.catch_up()
+    async with Reading.open_address(log.address) as reading:
+        then = await reading.as_of(1, sequence=6)
+    assert [node.parameters for node in then.tree] == [
+        {},
+        {"place": PLACE, "arm": "LEFT"},
+        {"target_location": PLACE},
+        {"target": PLACE},
+    ]
+
+
+def test_cases_and_the_live_page_have_the_pose() -> None:
+    types = {name_of(each): each for each in (GO, NAVIGATE, MOVE)}
+    cases: list[Case] = []
+    events = _script().stored()
+    refused = EpisodeCases().read(((event, happening_of(event)) for event in events), types.get, cases)
+    assert refused is None
+    navigated, went = cases
+    features = [navigated.numbers[f"target_location_{each}"] for each in ("x", "y", "z", "yaw")]
+    assert features == [went.numbers[f"place_{each}"] for each in ("x", "y", "z", "yaw")]
+    assert features == [1.0, 2.0, 0.0, 0.0]
+
+    activity = Activity(EpisodeRow(1, "e", 12, 12, T0_NS, None))
+    for event in events[:5]:
+        activity.read(event, {name: each.dtype for name, each in types.items()})
+    place = parameters_text({"target": PLACE}).removeprefix("target=")
+    assert activity.now == ["GoAction", f"NavigateAction target_location={place}", f"MoveMotion target={place}"]
