@@ -203,7 +203,7 @@ def _size_learned(lines: Lines) -> Verdict:
     learned = {database: lines["size"][database].get("learned") for database in DATABASES}
     bytes_a_node = {name: each["bytes_a_node"] for name, each in learned.items() if isinstance(each, Mapping)}
     if len(bytes_a_node) < len(learned):
-        return Verdict("not measured: install the extra 'learning'", False)
+        return Verdict("not measured: install the extra 'learning'", None)
     return _limits(bytes_a_node, lambda each: f"{each:,}", {"sqlite": 1_000, "postgresql": 1_400})
 
 
