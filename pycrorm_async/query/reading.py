@@ -276,12 +276,12 @@ class Reading:
     def mapped(self, designator: str | type) -> Any:
         """Return the mapped class of a dtype, a table or a designator class, as of the last `refresh`.
 
-        Before the first query it reads the types itself. Raises `CallerError` for a type that was never declared in
-        this memory, and once it is closed; `DatabaseUnavailable` if it does not exist yet.
+        Before the first query that reads the types it reads them itself. Raises `CallerError` for a type that was never
+        declared in this memory, and once it is closed; `DatabaseUnavailable` if it does not exist yet.
         """
         if self._is_closed:
             raise CallerError("this memory is closed: open it again")
-        if not self.is_open:
+        if not self.is_open or not self._declarations:  # a query without types opens the log and learns none
             with ThreadPoolExecutor(1, thread_name_prefix="pycrorm-types") as thread:
                 thread.submit(asyncio.run, self._learn_apart()).result()
         return self._classes.of(designator)

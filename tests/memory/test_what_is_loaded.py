@@ -102,11 +102,14 @@ async def test_a_plan_that_is_imported_while_a_memory_is_open_is_recorded(tmp_pa
         assert [each.description for each in await reading.episodes()] == ["LaterAction", "with a name", "LaterAction"]
 
 
-async def test_the_class_of_a_type_is_found_before_the_first_query(tmp_path: Path) -> None:
+@pytest.mark.parametrize("asks", [False, True])
+async def test_the_class_of_a_type_is_found_before_the_first_query(tmp_path: Path, *, asks: bool) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         with memory.recording.episode(description="another executive") as episode:
             episode.start("drive", memory.recording.type("action", "Drive", {"speed": float}), {"speed": 0.5})
         await memory.flush()
         assert not memory.reading.is_open
+        if asks:  # for a number, which reads no types
+            assert await memory.number_of(memory.recent_episodes[0]) == 1
         drive = memory.mapped("Drive")
         assert {"speed"} <= {*drive.__table__.c.keys()}
