@@ -29,6 +29,7 @@ _SQLITE = b"SQLite format 3\0"
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _REPORTED = 5_000
 """The messages between two reports of the progress."""
+_TIMES_NS = range(2**63)
 _TF = "tf2_msgs/msg/TFMessage"
 
 
@@ -61,7 +62,9 @@ def read_bag(path: Path, settings: RosMap, intake: Intake) -> None:
             topic, type_name = message.topic, message.type_name
             if episode.is_stored:
                 break
-            if not reader.wants(topic, type_name):
+            if message.at not in _TIMES_NS:
+                intake.left_out("messages", "their times are out of range")
+            elif not reader.wants(topic, type_name):
                 unwanted[topic, type_name] += 1
             elif reader.is_due(topic, type_name, message.at):
                 try:
@@ -94,7 +97,7 @@ class _Decoder:
             from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
         except ImportError:
             raise MissingExtra("bags need mcap and rosbags: pip install 'pycrorm-async[ros]'") from None
-        damage = struct.error, ValueError, AttributeError, IndexError, KeyError
+        damage = struct.error, ValueError, TypeError, AttributeError, IndexError, KeyError
         self.refusals: tuple[type[Exception], ...] = (SerdeError, TypesysError, *damage)
         self._types_of = get_types_from_msg
         self._latest = get_typestore(Stores.LATEST)
@@ -173,7 +176,8 @@ def _sqlite_messages(path: Path, intake: Intake) -> Iterator[_Message]:
         count = 0
         try:
             topics = {
-                number: (topic, name) for number, topic, name in database.execute("SELECT id, name, type FROM topics")
+                number: (str(topic), str(name))
+                for number, topic, name in database.execute("SELECT id, name, type FROM topics")
             }
             definitions = dict[str, str]()
             if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
@@ -190,8 +194,10 @@ def _sqlite_messages(path: Path, intake: Intake) -> Iterator[_Message]:
                 count += 1
                 if count % _REPORTED == 0:
                     intake.progress(count, total)
-                if number not in topics:
-                    intake.left_out("messages", "the file has no topic of their number")
+                if number not in topics or not isinstance(at, int) or not isinstance(data, bytes):
+                    intake.left_out(
+                        "messages", "the file has no topic of their number, or they have no time or content"
+                    )
                     continue
                 topic, name = topics[number]
                 yield _Message(at, topic, name, definitions.get(name, ""), _whole(data))

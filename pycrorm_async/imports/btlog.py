@@ -32,6 +32,8 @@ _IDLE, _RUNNING, _SUCCESS, _FAILURE, _SKIPPED = range(5)
 _TRANSITION = struct.Struct("<IHHB")
 _PAGE = 10_000
 """Bounds the transitions that are read at once."""
+_UID_DIGITS = 5
+"""Bounds the digits of an id, which has 16 bits in a transition."""
 _NEGATIVE = 2**47
 """Offsets of 48 bits from here on are negative: the clock was set back."""
 _CONTROLS = ("Control", "Decorator", "SubTree")
@@ -143,7 +145,7 @@ def _nodes_of(path: Path, xml: str) -> dict[int, _TreeNode]:
     stack: list[tuple[ET.Element, int | None]] = [(each, None) for each in (trees[0] if trees else ())]
     while stack:
         element, parent = stack.pop()
-        uid = int(text) if (text := element.get("_uid", "")).isdecimal() else None
+        uid = int(text) if (text := element.get("_uid", "")).isdecimal() and len(text) <= _UID_DIGITS else None
         inside = list(element)
         if element.tag == "SubTree" and (below := subtree_of(element)) is not None:
             inside = list(below)

@@ -397,7 +397,8 @@ class IntakeEpisode:
 
     def ended(self, status: object, at: int | None = None) -> None:
         """Set how the episode ended, and when, if that is after its last event; by default UNKNOWN."""
-        self._status = "UNKNOWN" if status not in _END_STATUSES else cast("EpisodeStatus", status)
+        is_known = isinstance(status, str) and status in _END_STATUSES
+        self._status = cast("EpisodeStatus", status) if is_known else "UNKNOWN"
         self._last = max(self._last, at or 0)
 
     def _end_all(self) -> None:
@@ -437,10 +438,8 @@ def _recorded(value: Any, known: FieldDeclared | None) -> tuple[FieldSpec, Any]:
             return "object", value
         case PoseValue():
             return "pose", value
-        case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation, **rest} if (
-            _item_type([*position, *orientation]) == "real"
-        ):
-            return "pose", pose_at(position, orientation, 0, str(rest.get("frame", "map")))
+        case {"position": _, "orientation": _} if (pose := pose_in(value)) is not None:
+            return "pose", pose
         case list() | tuple() if (item := _item_type(value)) is not None:
             return ("list", item), list(value)
         case dict() if (item := _item_type(value.values())) is not None:
@@ -454,6 +453,16 @@ def _item_type(values: Iterable[Any]) -> Literal["real", "text"] | None:
     if types and types <= {int, float}:
         return "real"
     return "text" if types == {str} else None
+
+
+def pose_in(value: Any) -> PoseValue | None:
+    """Return the pose that a dict of position, orientation (xyzw) and frame describes; None for another value."""
+    match value:
+        case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation, **rest} if (
+            _item_type([*position, *orientation]) == "real"
+        ):
+            return pose_at(position, orientation, 0, str(rest.get("frame", "map")))
+    return None
 
 
 def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map") -> PoseValue:

@@ -36,6 +36,9 @@ _INDEX = frozenset(
 """Columns that place a frame, and are no samples."""
 _SUCCESS = ("next.success", "success")
 _VIDEOS = ("video", "image")
+_PLAN_COLUMNS = frozenset(
+    "episode_index node parent kind dtype parameters status reason message dataset_from_index dataset_to_index".split()
+)
 _FPS_MAX = 1e6
 _TRAVERSAL = re.compile(r"{[^}:]*[.\[]")
 """Finds an attribute or an item in a template, which those of LeRobot do not have."""
@@ -141,12 +144,13 @@ class _DataSet:
                     "file_index": raw.get("data/file_index", 0),
                 }
                 file = self.path / self.info.data_path.format(**places)
+                tasks = [str(each) for each in raw.get("tasks") or ()]
             except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
                 raise intakes.WrongFormat(f"{self.path} describes its episodes otherwise: {error}") from None
             if self.path.resolve() not in file.resolve().parents:
                 raise intakes.WrongFormat(f"{self.path} names data outside of its folder")
             success = raw.get("success")
-            yield _Row(index, [str(each) for each in raw.get("tasks") or ()], length, file, success)
+            yield _Row(index, tasks, length, file, success)
 
     def rows(self, row: _Row) -> dict[str, np.ndarray[Any, Any]]:
         """Return the columns of an episode, in the order of its frames. Raises `_Unreadable`."""
@@ -187,6 +191,8 @@ class _DataSet:
         file = self.path / "meta" / "plan.parquet"
         nodes: dict[int, list[Mapping[str, Any]]] = {}
         for each in self._parquet(file, None) if file.exists() else ():
+            if not each.keys() >= _PLAN_COLUMNS:  # a file of this name of another program
+                return {}
             nodes.setdefault(int(each["episode_index"]), []).append(each)
         return nodes
 
@@ -197,11 +203,16 @@ class _DataSet:
         if table.exists():
             rows = list(self._parquet(table, None))
         elif lines.exists():
-            rows = [msgspec.json.decode(each, type=dict[str, Any]) for each in lines.read_bytes().splitlines() if each]
+            try:
+                content = lines.read_bytes().splitlines()
+                rows = [msgspec.json.decode(each, type=dict[str, Any]) for each in content if each]
+            except msgspec.DecodeError as error:
+                raise intakes.WrongFormat(f"{lines} has a line that is no JSON object: {error}") from None
         names = {}
         for each in rows:
-            text = next((str(value) for name, value in each.items() if isinstance(value, str)), "")
-            names[int(each.get(f"{kind}_index", -1))] = text
+            index = each.get(f"{kind}_index")
+            if isinstance(index, int):
+                names[index] = next((value for value in each.values() if isinstance(value, str)), str(index))
         return names
 
     def _parquet(self, file: Path, columns: Sequence[str] | None) -> Iterator[Mapping[str, Any]]:

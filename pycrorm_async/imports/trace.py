@@ -17,6 +17,7 @@ document "Trace Event Format" of the Chromium project; the OTLP specification 1.
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
 import math
 import re
@@ -185,7 +186,7 @@ def _read_events(path: Path, document: Mapping[str, Any], settings: TraceMap, in
     spans = reader.spans()
     begin = min([each.start for each in spans] + [at for at, _ in reader.others], default=0)
     episode = intake.episode(
-        str(own.get("episode") or intakes.identity_of(path)),
+        intakes.identity_of(path),
         _time(own.get("begin_ns")) or begin,
         description=str(own.get("description") or f"Trace {path.name}"),
         metadata={"file": path.name, **({"names": sorted(reader.names)} if reader.names else {})},
@@ -284,7 +285,10 @@ class _EventReader:
             case "C":
                 self.others.append((at, _observation(name, arguments)))
             case _ if phase in _INSTANTS and isinstance(arguments.get(OWN), dict):
-                self.others.append((at, _change(arguments[OWN])))
+                if (change := _change(arguments[OWN])) is None:
+                    self._intake.left_out("instants", "they have the key pycrorm, but are not those of our export")
+                else:
+                    self.others.append((at, change))
             case _ if phase in _INSTANTS:
                 instant = self._add(chain if phase == "n" else thread, name, {}, at, at)
                 self._instants[instant.key] = name, arguments
@@ -341,17 +345,18 @@ def _own_span(
     has_objects: bool = True,
 ) -> Span:
     """Return the node of an export of ours; where the file has no objects, their names take their places."""
-    kind, failure = own.get("kind"), own.get("failure")
-    status: Any = own.get("status")
+    kind, failure, parent = own.get("kind"), own.get("failure"), own.get("parent")
+    status = own.get("status")
+    known: Any = status if isinstance(status, str) and status in _STATUSES else "UNKNOWN"
     return Span(
         own["node"],
         str(own.get("dtype") or dtype),
         {name: _object_of(each, has_objects=has_objects) for name, each in parameters.items()},
         start,
         end,
-        parent=own.get("parent"),
+        parent=parent if isinstance(parent, int | str) else None,
         kind=kind if kind in ("motion", "language") else "action",
-        status=status if status in _STATUSES else "UNKNOWN",
+        status=known,
         failure=(str(failure[0]), str(failure[1])) if isinstance(failure, list) and len(failure) == 2 else None,
         result=own.get("result"),
     )
@@ -365,26 +370,40 @@ def _object_of(value: Any, *, has_objects: bool) -> Any:
     return value
 
 
-def _change(own: Mapping[str, Any]) -> _Give:
-    """Return what gives an observation or a change of an object, of an export of ours, to an episode."""
-    if "observed" in own:
-        name, values, node = str(own["observed"]), own.get("values"), own.get("node")
-        return lambda episode, at: episode.observe(name, values, at, node=node)
-    key, pose, joints = own.get("object"), own.get("pose"), own.get("joints", {})
+def _change(own: Mapping[str, Any]) -> _Give | None:
+    """Return what gives an observation or a change of an object, of an export of ours; None for another instant."""
+    match own:
+        case {"observed": str() as name, "node": int() | None as node, **rest}:
+            values = rest.get("values")
+            return lambda episode, at: episode.observe(name, values, at, node=node)
+        case {"object": int() as key, "removed": True}:
+            return lambda episode, at: episode.object_removed(key, at)
+        case {"object": int() as key, "name": str() as name, "type": str() as kind, **rest}:
+            pose, given = rest.get("pose"), rest.get("joints")
+            joints = (
+                {each: position for each, position in given.items() if _is_number(position)}
+                if isinstance(given, dict)
+                else {}
+            )
+            placed = intakes.pose_in(pose)
+            if placed is None and pose is not None:
+                return None
 
-    def give(episode: IntakeEpisode, at: int) -> None:
-        if isinstance(pose, dict):
-            value = intakes.pose_at(pose["position"], pose["orientation"], at, str(pose.get("frame", "map")))
-            if not episode.has_object(key):
-                episode.object_added(key, str(own.get("name")), str(own.get("type")), value, at, joints=joints)
-                return
-            episode.object_moved(key, value, at)
-        if own.get("removed"):
-            episode.object_removed(key, at)
-        elif joints:
-            episode.joints_moved(key, joints, at)
+            def give(episode: IntakeEpisode, at: int) -> None:
+                if placed is not None and not episode.has_object(key):
+                    episode.object_added(key, name, kind, placed, at, joints=joints)
+                    return
+                if placed is not None:
+                    episode.object_moved(key, placed, at)
+                if joints:
+                    episode.joints_moved(key, joints, at)
 
-    return give
+            return give
+    return None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _time(value: Any) -> int | None:
@@ -467,9 +486,10 @@ class _Trace:
         service = self.resources.get("service.name")
         described = self._description or " ".join(str(each) for each in (service, *tops[:1]) if each)
         metadata = {"file": path.name, "trace": trace_id, "resource": self.resources}
-        episode = intake.episode(
-            trace_id or intakes.identity_of(path), self.begin, description=described, metadata=metadata
-        )
+        # Another file may have other spans of the trace, which must not count as stored.
+        digest = hashlib.sha256(" ".join(sorted(self.spans)).encode()).hexdigest()[:16]
+        name = f"{trace_id}-{digest}"
+        episode = intake.episode(name, self.begin, description=described, metadata=metadata)
         with episode:
             give_spans(episode, spans)
             episode.ended(self.status, self.end)

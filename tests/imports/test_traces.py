@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import json
 import os
+import random
 import signal
 import subprocess
 import time
@@ -14,8 +16,10 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import PoseValue
 from pycrorm_async.imports.intake import TYPES_MAX
+from pycrorm_async.imports.registry import import_files
 from pycrorm_async.world.pose import Pose
 from tests.commands import COMMAND, environment, one_line_of, pycrorm
 from tests.databases import ask
@@ -167,6 +171,40 @@ def test_a_list_without_its_last_bracket_is_whole_and_one_cut_inside_an_event_is
     report = imported(tmp_path, "trace", tmp_path / "t.json")
     assert [each.nodes for each in report.episodes] == [2]
     assert len(report.cut) == rest.count("{")
+
+
+_STRANGE: list[Any] = [None, True, -1, 1e300, 10**30, "", "x" * 300, "\x1b[2J", [], [[]], {}, {"": {"": 0}}, [1, "a"]]
+
+
+def _changed(value: Any, randomness: random.Random) -> Any:
+    """Return a copy of a document in which some values, at any depth, are others."""
+    if randomness.random() < 0.03:
+        return randomness.choice(_STRANGE)
+    if isinstance(value, dict):
+        return {key: _changed(each, randomness) for key, each in value.items() if randomness.random() > 0.02}
+    return [_changed(each, randomness) for each in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize("file_format", ["trace", "otlp"])
+def test_a_document_with_any_other_values_is_refused_in_one_line_or_imported(tmp_path: Path, file_format: str) -> None:
+    source = f"sqlite:///{tmp_path}/source.db"
+    recorded_walk(source)
+    pycrorm("export", "1", "--format", file_format, "--out", tmp_path / "walk.json", "--url", source, cwd=tmp_path)
+    document = json.loads((tmp_path / "walk.json").read_text())
+    randomness, read = random.Random(1), 0
+    paths = [tmp_path / f"{number}.json" for number in range(300)]
+    for path in paths:
+        path.write_text(json.dumps(_changed(document, randomness)))
+        with contextlib.suppress(CallerError):
+            read += len(import_files("trace", [path], None).episodes)
+    assert read > 100
+    with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
+        for path in paths[:40]:
+            with contextlib.suppress(CallerError):
+                import_files("trace", [path], memory.recording)
+        memory.flush()
+    done = pycrorm("verify", "--url", f"sqlite:///{tmp_path}/memory.db", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_hostile_names_and_thousands_of_them_make_few_types_and_no_faults(tmp_path: Path) -> None:
