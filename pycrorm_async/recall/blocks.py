@@ -27,6 +27,7 @@ from pycrorm_async.recall.columns import (
     RESERVED,
     Case,
     Column,
+    Mask,
     Summary,
     Words,
     is_angle,
@@ -172,13 +173,42 @@ class Block:
 
     def without(self, nodes: NDArray[np.int64]) -> Block:
         """Return the block without the cases of these nodes."""
-        kept = {name: np.isin(group.nodes, nodes, invert=True) for name, group in self.groups.items()}
+        return self._kept({name: np.isin(each.nodes, nodes, invert=True) for name, each in self.groups.items()})
+
+    def of_episodes(self, first: int, end: int) -> Block:
+        """Return the block with the cases of the episodes from number `first` up to but not including `end`."""
+        groups = self.groups.items()
+        return self._kept({name: (each.episodes >= first) & (each.episodes < end) for name, each in groups})
+
+    def _kept(self, kept: Mapping[str, Mask]) -> Block:
         groups = {
             name: group if kept[name].all() else group.taken(kept[name])
             for name, group in self.groups.items()
             if kept[name].any()
         }
         return Block(groups, self.left_out)
+
+
+def is_same(one: Block, other: Block) -> bool:
+    """Return whether two blocks have equal cases; their dictionaries may have further words."""
+    return one.groups.keys() == other.groups.keys() and all(
+        _is_same_group(group, other.groups[name]) for name, group in one.groups.items()
+    )
+
+
+def _is_same_group(one: Group, other: Group) -> bool:
+    pairs = (one.nodes, other.nodes), (one.started_us, other.started_us), (one.parents, other.parents)
+    if not all(np.array_equal(*each) for each in pairs):
+        return False
+    for columns, others in ((one.texts, other.texts), (one.numbers, other.numbers)):
+        present, others_present = (
+            {name: column for name, column in each.items() if column.present().any()} for each in (columns, others)
+        )
+        if present.keys() != others_present.keys() or not all(
+            column.equals(others_present[name]) for name, column in present.items()
+        ):
+            return False
+    return True
 
 
 def merge(blocks: Sequence[Block]) -> Block:

@@ -159,6 +159,13 @@ class Column:
         mask: Mask = ~np.isnan(self.values) if self._words is None else self.values > 0
         return mask
 
+    def equals(self, other: Column) -> bool:
+        """Return whether another column of the same feature has the same value for each case."""
+        if self.is_number or other.is_number:
+            return self.is_number == other.is_number and np.array_equal(self.values, other.values, equal_nan=True)
+        codes = np.array([0, *(other.words.codes.get(each, -1) for each in self.words)])
+        return np.array_equal(codes[self.values], other.values)
+
     def taken(self, rows: NDArray[Any]) -> Column:
         """Return the column of some of its cases: of these rows, or those for which a mask is True."""
         return Column(self.values[rows], self._words)

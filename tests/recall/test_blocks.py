@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from sqlalchemy import event
 
 from pycrorm_async import Reading
-from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall.blocks import WORDS_MAX, Block, decode, encode, merge
+from pycrorm_async.events.ids import row_id, row_key
+from pycrorm_async.recall.blocks import WORDS_MAX, Block, decode, encode, is_same, merge
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, StoredBlocks
 from pycrorm_async.recall.search import forgotten
@@ -52,6 +52,31 @@ def test_the_same_cases_make_the_same_bytes_in_any_order_and_in_any_parts(
     parts = [mixed[: borders[0]], mixed[borders[0] : borders[1]], mixed[borders[1] : borders[2]], mixed[borders[2] :]]
     blocks = [decode(encode(Block.of(part))) for part in parts if part]
     assert encode(merge(blocks)) == data
+
+
+@settings(max_examples=100)
+@given(CASES, CASES, st.randoms())
+def test_blocks_are_the_same_where_their_cases_are_whatever_else_they_had(
+    cases: list[Case], others: list[Case], chance: random.Random
+) -> None:
+    episode = max(row_key(each.node).number for each in cases) + 1
+    elsewhere = [each._replace(node=row_id(episode, row_key(each.node).sequence, 0), parent=None) for each in others]
+    block = Block.of(cases)
+    assert is_same(block, Block.of([*cases, *elsewhere]).of_episodes(0, episode))
+    changed = chance.choice(cases)
+    rest = [each for each in cases if each is not changed]
+    symbols, numbers = {**changed.symbols, "changed": "yes"}, {**changed.numbers, "changed": 1.0}
+    for other in (
+        rest,
+        [*cases, changed],
+        [*rest, changed._replace(symbols=symbols)],
+        [*rest, changed._replace(numbers=numbers)],
+        [*rest, changed._replace(type="ChangedAction")],
+        [*rest, changed._replace(started_us=changed.started_us + 1)],
+        [*rest, changed._replace(status="CHANGED")],
+        [*rest, changed._replace(duration_s=None if changed.duration_s else 1.0)],
+    ):
+        assert not is_same(block, Block.of(other))
 
 
 def test_a_case_keeps_its_parent_and_that_it_was_simulated() -> None:
