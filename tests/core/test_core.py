@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,21 +25,36 @@ from hypothesis import strategies as st
 from pycrorm_async import core
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.core.build import NotCompiled, compile_core
-from pycrorm_async.errors import PycrormError, SpoolDamaged
+from pycrorm_async.errors import EpisodeFull, PycrormError, SpoolDamaged, SpoolFull
 from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.queue.appender import Appender
 from pycrorm_async.queue.format import (
+    EVENT,
+    Frame,
     ReadCursor,
     Reader,
     ReadPlace,
     SegmentHeader,
     decode_each,
     decode_header,
+    encode,
     header_bytes,
     salt_of,
 )
 from pycrorm_async.queue.scan import SegmentScanner
-from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, append, ended, episode, node, record, started
+from tests.queue import factories
+from tests.queue.factories import (
+    MONOTONIC_NS,
+    RECORDER,
+    STILL,
+    WALL_NS,
+    FolderWriter,
+    append,
+    ended,
+    episode,
+    node,
+    started,
+)
 
 ROOT = Path(__file__).parent.parent.parent
 compiled = pytest.mark.skipif(not core.IS_COMPILED, reason=f"the core is not compiled: {core.PURE_REASON}")
@@ -86,7 +102,12 @@ nodes = st.builds(
     st.sampled_from(["NodeStarted", "NodeEnded", "x", "ä" * 127, "x" * 255, "EpisodeTagged"]),
 )
 headings = st.one_of(
-    nodes, nodes, nodes, st.builds(started, st.integers(1, 3)), st.builds(ended, st.integers(1, 3)), st.just(DECLARED)
+    nodes,
+    nodes,
+    nodes,
+    st.builds(started, st.integers(1, 3)),
+    st.builds(ended, st.integers(1, 3)),
+    st.just(factories.DECLARED),
 )
 steps = st.one_of(
     st.builds(Step, headings, st.one_of(st.integers(0, 70), st.integers(0, 2_100)), st.booleans()),
@@ -100,7 +121,8 @@ def written_by(spool: Path, steps: list[Step], clock: Clock) -> tuple[list[bytes
     outcomes: list[object] = []
     for heading, size, reserved in steps:
         if heading is None:
-            author.sync()
+            if author.appender._span_count:  # as a queue does
+                author.sync()
             continue
         try:
             outcomes.append(append(author.appender, heading, b"%d" % size * size if size else b"", reserved))
@@ -147,10 +169,38 @@ def test_the_compiled_core_appends_all_that_needs_no_decision(tmp_path: Path, mo
 
     monkeypatch.setattr(Appender, "put", watched)
     author = FolderWriter(tmp_path)
-    for heading in (started(), node(), DECLARED, node(), node(), ended()):
+    for heading in (started(), node(), factories.DECLARED, node(), node(), ended()):
         author.put(heading)
     assert decided == ["EpisodeStarted", "DesignatorTypeDeclared", "EpisodeEnded"]
     author.appender.close()
+
+
+@compiled
+def test_the_compiled_core_leaves_the_reserve_free_and_ends_a_full_episode_as_python_does(tmp_path: Path) -> None:
+    answers = []
+    for name, clock in (("compiled", STILL), ("python", Clock(lambda: WALL_NS, lambda: MONOTONIC_NS))):
+        author = FolderWriter(tmp_path / name, clock=clock)
+        author.put(started())
+        put = partial(append, author.appender)
+        counts = []
+        for reserved in (False, True):
+            with pytest.raises(SpoolFull):
+                while True:
+                    put(node(), b"x" * 200, reserved)
+            counts.append(author.appender.position)
+        full = FolderWriter(tmp_path / f"full {name}", clock=clock)
+        full.put(started())
+        full.appender._events_max = 3
+        put = partial(append, full.appender)
+        assert [put(node(), b"{}", True) for _ in range(2)] == [2, 3]
+        with pytest.raises(EpisodeFull):
+            put(node(), b"{}", True)
+        assert put(node()._replace(type="NodeEnded"), b"{}", True) == 4
+        answers.append(counts)
+        for each in (author, full):
+            each.appender.close()
+    assert answers[0] == answers[1]
+    assert answers[0][0] < answers[0][1]
 
 
 @compiled
@@ -168,6 +218,10 @@ def test_a_sync_that_begins_while_it_is_woken_hears_of_the_next_record(tmp_path:
     author.put(node())
     author.put(node())
     assert woken == [2, 3]
+    author.appender._wake = partial(woken.append, 0)
+    for _ in range(3):
+        author.put(node())
+    assert woken == [2, 3, 0]
     author.appender.close()
 
 
@@ -203,6 +257,21 @@ def test_no_record_is_put_while_another_thread_changes_the_state(tmp_path: Path)
     assert author.appender._gc_lock.run(change) == 1
     thread.join()
     assert author.appender.position == 2
+    author.appender.close()
+
+
+def test_the_remains_of_an_interrupted_put_change_no_record(author: FolderWriter) -> None:
+    """A body without a header is where the next record is written."""
+    author.put(started())
+    end, buffer = author.end, author.appender._buffer
+    buffer[end : end + 300] = b"x" * 300
+    author.put(node(), b"123")
+    written = buffer[end : author.end]
+    assert written[64:] == b"NodeStarted123\0\0"
+    assert (
+        encode(Frame(EVENT, 1, 2, 2, WALL_NS, MONOTONIC_NS, episode(1), b"NodeStarted", b"123"), salt_of(RECORDER, 1))
+        == written
+    )
     author.appender.close()
 
 
@@ -278,11 +347,11 @@ def author(tmp_path: Path) -> FolderWriter:
 @pytest.fixture
 def two_segments(tmp_path: Path) -> FolderWriter:
     """Two episodes, a declaration, an end, commit frames, and unsynced records behind them."""
-    author = FolderWriter(tmp_path, settings=replace(SMALL, segment_bytes=1272, record_bytes_max=100))
-    for heading in (started(1), node(1), DECLARED, started(2)):
+    author = FolderWriter(tmp_path, settings=replace(factories.SMALL, segment_bytes=1272, record_bytes_max=100))
+    for heading in (started(1), node(1), factories.DECLARED, started(2)):
         author.put(heading, b"1")
     author.sync()
-    for heading in (node(2), node(1), node(2), ended(2), node(1), node(1)):
+    for heading in (node(2), node(1), node(2), ended(2), started(3), ended(3), node(1)):
         author.put(heading, b"23")
     author.sync()
     for _ in range(3):
@@ -324,6 +393,21 @@ def test_every_torn_byte_of_a_folder_is_read_alike(two_segments: FolderWriter) -
 
 
 @compiled
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_frame_that_another_segment_left_is_no_record_to_either_core(author: FolderWriter, number: int) -> None:
+    for heading in (started(), node()):
+        author.put(heading, b"1")
+    author.appender.close()
+    [path] = author.segments
+    frame = Frame(EVENT, 1, 3, 3, WALL_NS, 1, episode(1), b"NodeStarted", b"{}")
+    factories.overwrite(path, author.end, encode(frame, salt_of(RECORDER, number)))
+    outcome = outcome_of(author.folder, 2)
+    assert len(outcome[-4]) == (3 if number == 1 else 2)  # type: ignore[arg-type]
+    with python_alone():
+        assert outcome_of(author.folder, 2) == outcome
+
+
+@compiled
 def test_whole_folders_are_read_alike_and_by_the_compiled_core(two_segments: FolderWriter) -> None:
     outcome = outcome_of(two_segments.folder, len(two_segments.records))
     records = [each for batch in outcome[:-4] for each in batch.records]  # type: ignore[attr-defined]
@@ -340,7 +424,9 @@ def test_whole_folders_are_read_alike_and_by_the_compiled_core(two_segments: Fol
 @given(
     st.lists(
         st.builds(
-            lambda text, wall: record(1, node(), 1, text.encode())._replace(wall_ns=wall), st.text(), st.integers()
+            lambda text, wall: factories.record(1, node(), 1, text.encode())._replace(wall_ns=wall),
+            st.text(),
+            st.integers(),
         )
     )
 )
@@ -350,10 +436,10 @@ def test_both_cores_make_the_same_values_of_rows(records: list[Record]) -> None:
 
 @compiled
 def test_values_of_records_that_no_database_holds_are_refused_by_both_cores() -> None:
-    damaged = record(1, node(), 1, b"\xff")
+    damaged = factories.record(1, node(), 1, b"\xff")
     for make in (core.event_values, core._event_values):
         with pytest.raises(UnicodeDecodeError):
-            make([record(1, node(), 1, b"{}"), damaged], 1)
+            make([factories.record(1, node(), 1, b"{}"), damaged], 1)
     for wrong in (damaged[:7], "text", damaged._replace(payload="text")):  # type: ignore[arg-type]
         with pytest.raises((TypeError, IndexError, SystemError)):
             core.event_values([wrong], 1)
