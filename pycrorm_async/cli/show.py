@@ -291,7 +291,11 @@ _MESSAGE_MAX = 100
 _SIMULATIONS_MAX = 10
 """Bounds the episode numbers listed at a node, because a node may run hundreds of simulations."""
 
-_STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
+_STYLES = {
+    "SUCCEEDED": "green",
+    "RUNNING": "cyan",
+    **dict.fromkeys(("LOST", "CANCELLED", "INTERRUPTED", "UNKNOWN"), "yellow"),
+}
 
 
 def print_tree(nodes: Sequence[named_queries.NodeSummary], *, events: bool = False, full: bool = False) -> None:

@@ -142,7 +142,7 @@ _HEAD_LINES = 6
 """The lines of the terminal that the tree leaves for the rest of the picture."""
 _LISTED_ENDED = 10
 """Bounds the ended episodes that are listed below the running ones."""
-_SIGNS = {"RUNNING": "cyan", "SUCCEEDED": "green", "LOST": "yellow", "INTERRUPTED": "yellow"}
+_SIGNS = {"RUNNING": "cyan", "SUCCEEDED": "green", "LOST": "yellow", "INTERRUPTED": "yellow", "UNKNOWN": "yellow"}
 
 
 async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) -> None:

@@ -506,8 +506,7 @@ class _Episode:
             if count % 10_000 == 0:
                 self._intake.progress(count, count)
             if (moved := frames.place(each)) is not None:
-                due = min(due, at)
-                if each.is_own:
+                if each.is_own or not episode.has_object(moved):
                     yield at, partial(self._add, episode, moved, moved in robots, frames.pose(moved, at))
             elif self._settings.streams:
                 block = streams[each.parent, each.child]
@@ -519,6 +518,7 @@ class _Episode:
                 for iri, pose in frames.poses(at):
                     yield at, partial(self._add, episode, iri, iri in robots, pose)
                 due = at + period
+        yield from ((at, partial(self._add, episode, iri, iri in robots, pose)) for iri, pose in frames.poses(at))
         yield from ((at, partial(_give_stream, episode, block)) for block in streams.values() if block)
 
     def _corrected(self, given: Iterable[Transform]) -> Iterator[Transform]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -37,6 +38,8 @@ _LINES_MAX: Final = 2**24
 """Bounds the bytes of one line of JSON: a document of MongoDB has at most 16 MiB."""
 _UNIT: Final = 1e-6
 """The length of a quaternion that differs from 1 by less is that of rounding, and kept."""
+_MILLISECONDS: Final = 1e11
+"""Times from this number on are in ms, smaller ones in s: it is the year 5138 in s, and 1973 in ms."""
 _Documents = Iterator[Mapping[str, Any]]
 
 
@@ -118,12 +121,16 @@ def _is_data(file: Path) -> bool:
 # === documents ================================================================================================
 
 
-def documents(path: Path) -> _Documents:
-    """Yield the documents of a file, one after the other. Raises `WrongFormat`, `FileCut` and `MissingExtra`."""
+def documents(path: Path, *, plainly: bool = True) -> _Documents:
+    """Yield the documents of a file, one after the other; without `plainly` those of BSON with the types of `bson`.
+
+    Raises `WrongFormat`, `FileCut` and `MissingExtra`.
+    """
     name = path.name.removesuffix(".gz")
     with _opened(path) as file:
         if name.endswith(".bson"):
-            yield from _bson_documents(path, file)
+            found = _bson_documents(path, file)
+            yield from map(plain, found) if plainly else found
         else:
             yield from _json_documents(path, file)
 
@@ -164,7 +171,7 @@ def _bson_documents(path: Path, file: IO[bytes]) -> _Documents:
         if len(body) < size - 4 or size == 0:
             raise FileCut(f"ends in the middle of document {count + 1:,}; those before are imported")
         try:
-            yield plain(bson.decode(head + body, options))
+            yield bson.decode(head + body, options)
         except InvalidBSON as error:
             if count == 0:
                 raise WrongFormat(f"{path} is no file of BSON: {error}") from None
@@ -354,26 +361,42 @@ def triples(path: Path, left_out: Any) -> Iterator[Triple]:
 
 def transforms(path: Path, left_out: Any) -> Iterator[Transform]:
     """Yield the transforms of a file; `left_out` is called with what is none, and the reason."""
-    for document in documents(path):
+    for document in documents(path, plainly=False):
         try:
-            header, transform = document["header"], document["transform"]
-            translation, rotation = transform["translation"], transform["rotation"]
-            x, y, z = (float(translation[each]) for each in "xyz")
-            qx, qy, qz, qw = (float(rotation[each]) for each in "xyzw")
-            stamp = header["stamp"]
-            if isinstance(stamp, Mapping):
-                at = int(stamp.get("secs", stamp.get("sec"))) * 10**9 + int(stamp.get("nsecs", stamp.get("nanosec", 0)))
-            else:
-                at = stamp * 1_000_000 if isinstance(stamp, int) else round(float(stamp) * 1e6) * 1000
-            parent, child = str(header["frame_id"]).strip("/"), str(document["child_frame_id"]).strip("/")
+            try:
+                transform = _transform(document)
+            except TypeError:  # a number of MongoDB's own, such as a decimal
+                transform = _transform(plain(document))
         except (KeyError, TypeError, ValueError, OverflowError):
             left_out("transforms", "they lack a frame, a number or a time")
             continue
-        norm = (qx * qx + qy * qy + qz * qz + qw * qw) ** 0.5
-        if not (0.5 < norm < 2) or not abs(x) + abs(y) + abs(z) < 1e9 or not 0 <= at < 2**63:
+        x, y, z = transform.position
+        norm = math.hypot(*transform.orientation)
+        if not (0.5 < norm < 2) or not abs(x) + abs(y) + abs(z) < 1e9 or not 0 <= transform.at < 2**63:
             left_out("transforms", "they have no rotation, or a number out of range")
-            continue
-        turn = (qx, qy, qz, qw) if abs(norm - 1) < _UNIT else (qx / norm, qy / norm, qz / norm, qw / norm)
-        own = document.get("__ns")
-        is_own = isinstance(own, int) and 0 <= own < 2**63
-        yield Transform(cast("int", own) if is_own else at, parent, child, (x, y, z), turn, is_own)
+        elif abs(norm - 1) < _UNIT:
+            yield transform
+        else:
+            qx, qy, qz, qw = (each / norm for each in transform.orientation)
+            yield transform._replace(orientation=(qx, qy, qz, qw))
+
+
+def _transform(document: Mapping[str, Any]) -> Transform:
+    header, transform = document["header"], document["transform"]
+    place, turn, stamp, own = transform["translation"], transform["rotation"], header["stamp"], document.get("__ns")
+    if isinstance(own, int):
+        at = own
+    elif isinstance(stamp, Mapping):
+        at = int(stamp.get("secs", stamp.get("sec"))) * 10**9 + int(stamp.get("nsecs", stamp.get("nanosec", 0)))
+    elif isinstance(stamp, float) and stamp < _MILLISECONDS:
+        at = round(stamp * 1e6) * 1000
+    else:
+        at = int(stamp) * 1_000_000
+    return Transform(
+        at,
+        str(header["frame_id"]).strip("/"),
+        str(document["child_frame_id"]).strip("/"),
+        (float(place["x"]), float(place["y"]), float(place["z"])),
+        (float(turn["x"]), float(turn["y"]), float(turn["z"]), float(turn["w"])),
+        isinstance(own, int),
+    )

@@ -175,8 +175,8 @@ class _Tools:
     ) -> list[dict[str, Any]]:
         """List the newest episodes, the oldest of them first: number, status, start, duration, nodes, failed nodes.
 
-        Optional conditions: `status` (RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED, LOST), `text` in description,
-        plan or tags, `tag`, `robot` (name or model). `limit` is 1 to 200.
+        Optional conditions: `status` (RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED, LOST, UNKNOWN), `text` in its
+        description, plan or tags, `tag`, `robot` (name or model). `limit` is 1 to 200.
         """
         choice = EpisodeChoice(status, None, (tag,) if tag else (), robot, text, _bounded("limit", limit, 200))
         return [_episode(each) for each in await (await self._open()).episodes(choice)]

@@ -15,7 +15,7 @@ from pycrorm_async.world.pose import ObjectType
 class ProcessMetaData(Base):
     """An episode with its user, plan, software and outcome. `id` is the episode's number in this database.
 
-    `status` is RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED or LOST.
+    `status` is RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED, LOST or UNKNOWN.
     """
 
     __tablename__ = "process_metadata"

@@ -119,7 +119,7 @@ FAILED = frozenset({"FAILED", "ERROR", "LOST"})
 _GOOD, _BAD, _RUNNING, _OTHER = "#2f8f46", "#dd4238", "#2f7fd1", "#a8740c"
 COLORS: Mapping[str, str] = {"SUCCEEDED": _GOOD, "FAILED": _BAD, "ERROR": _BAD, "RUNNING": _RUNNING}
 """Each has a contrast of about 4 with a white page and with a dark one."""
-_SIGNS = {"SUCCEEDED": "✓", "FAILED": "✗", "ERROR": "✗", "RUNNING": "▶", "LOST": "?"}
+_SIGNS = {"SUCCEEDED": "✓", "FAILED": "✗", "ERROR": "✗", "RUNNING": "▶", "LOST": "?", "UNKNOWN": "?"}
 _SIGNS |= {"CANCELLED": "⊘", "INTERRUPTED": "⊘"}
 _RECORDED_TEXT_MAX = 200
 """Bounds the characters of a recorded text in a view."""

@@ -194,8 +194,8 @@ class RecordedEpisode(EpisodeWriter):
 
     Attributes:
         is_recorded: whether the log has this episode with its end already; nothing is recorded then.
-        refusal: why nothing more is recorded of an episode with a name of its own: the log cannot be read, or has other
-            events of this name; None without a reason.
+        refusal: why nothing, or nothing more, is recorded: the log cannot be read, or has other events of this name,
+            or the episode is open; None without a reason.
     """
 
     def __init__(
@@ -722,7 +722,7 @@ class RecordedEpisode(EpisodeWriter):
             self.emitter.note_fault("EpisodeStarted", error)
             if is_added:
                 self._episodes.by_id.pop(self.id, None)
-            self.closed = True
+            self.closed, self.refusal = True, message_of(error)
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
         """Write the end of the episode; leave a named one that is interrupted without an end."""

@@ -14,7 +14,7 @@ from uuid import UUID
 
 import pytest
 
-from pycrorm_async import Memory
+from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import episode_text, named_episode_id
 from pycrorm_async.events.types import SeenValue
@@ -242,6 +242,33 @@ async def test_a_name_is_found_inside_a_running_loop(tmp_path: Path) -> None:
     for turn in range(2):
         async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
             assert record_drives(memory.recording, "drives.log", 3).is_recorded == (turn == 1)
+
+
+def test_an_import_runs_beside_a_live_memory(tmp_path: Path) -> None:
+    with opened(tmp_path) as live, live.recording.episode(description="live") as episode:
+        episode.observe("before", 1)
+        with opened(tmp_path) as memory:
+            record_drives(memory.recording, "drives.log", 3)
+        episode.observe("after", 2)
+    assert_verified(tmp_path)
+    assert rows(tmp_path, "SELECT description, status FROM process_metadata ORDER BY id") == [
+        ("live", "SUCCEEDED"),
+        ("an import", "SUCCEEDED"),
+    ]
+
+
+def test_two_processes_that_record_one_name_are_refused_in_one_line(tmp_path: Path) -> None:
+    hasty = Settings(fold="at_end", flush_timeout_s=0.5)
+    with opened(tmp_path) as first:
+        episode = first.recording.episode(id="drives.log", at=START)
+        with opened(tmp_path, hasty) as second:
+            again = record_drives(second.recording, "drives.log", 3)
+            assert "another process records this episode" in str(again.refusal)
+            assert second.status.faults.total == 1
+        assert "is open already" in str(first.recording.episode(id="drives.log", at=START).refusal)
+        episode.close(at=START)
+    assert_verified(tmp_path)
+    assert rows(tmp_path, "SELECT count(*) FROM process_metadata") == [(1,)]
 
 
 # === frames ===================================================================================================

@@ -2,7 +2,7 @@
 // A document is the part of an episode behind an event: a file has one, a stream more and more of them.
 
 export const FAILED = new Set(["FAILED", "ERROR"]);
-const END = { SUCCEEDED: "✓", FAILED: "✗", ERROR: "✗", RUNNING: "▶", LOST: "?", CANCELLED: "⊘", INTERRUPTED: "⊘" };
+const END = { SUCCEEDED: "✓", FAILED: "✗", ERROR: "✗", RUNNING: "▶", LOST: "?", UNKNOWN: "?", CANCELLED: "⊘", INTERRUPTED: "⊘" };
 
 /** The sign of a status, so that it is readable without colour. */
 export const signOf = (status) => END[status] ?? "•";

@@ -10,7 +10,8 @@ const ACTIONS_MAX = 20;
 const ROWS_MAX = 2000;
 
 const part = (name) => document.getElementById(name);
-const ended = (episodes) => episodes.filter((each) => each.status !== "RUNNING");
+/** The episodes that ended, and of which it is known how. */
+const ended = (episodes) => episodes.filter((each) => each.status !== "RUNNING" && each.status !== "UNKNOWN");
 const succeeded = (episodes) => ended(episodes).filter((each) => each.status === "SUCCEEDED").length;
 const rateOf = (episodes) => (ended(episodes).length === 0 ? null : succeeded(episodes) / ended(episodes).length);
 const percent = (rate) => `${(rate * 100).toFixed(0)} %`;
