@@ -116,7 +116,7 @@ def test_every_run_names_an_existing_script() -> None:
 def test_the_readme_shows_each_table_as_it_was_measured() -> None:
     page = (ROOT / "bench" / "README.md").read_text()
     assert all(f"<!-- bench: {name} -->" in page for name in TABLES)
-    assert written(page, _lines(ROOT / "bench" / "figures")) == page
+    assert written(page, _lines(ROOT / "bench" / "figures")) == page, "run: python -m bench --write"
 
 
 # === quick ====================================================================================================

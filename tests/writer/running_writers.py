@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterable
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
+from typing import Literal
 
 from pycrorm_async import Memory
 from pycrorm_async.operations.daemon import serve
@@ -91,5 +92,7 @@ class Daemon:
 Start = Callable[..., AbstractAsyncContextManager[Daemon]]
 
 
-def memory_at(url: str, spool: Path, settings: Settings = QUICKLY_SYNCED) -> Memory:
-    return Memory.open(url, spool=spool, writer="daemon", settings=settings)
+def memory_at(
+    url: str, spool: Path, settings: Settings = QUICKLY_SYNCED, *, writer: Literal["daemon", "process"] = "daemon"
+) -> Memory:
+    return Memory.open(url, spool=spool, writer=writer, settings=settings)
