@@ -16,6 +16,10 @@ allocation. `_making` keeps both from allocating the same segment. The order is 
 thread takes only `_making` for its allocation, so that producers can go on, and pauses the garbage collector meanwhile,
 because a finalizer that records would wait for `_making` in the same thread.
 
+The compiled core (`pycrorm_async.core`) appends an event of an open episode that fits without `_gc_lock`: it holds the
+interpreter lock from its first look at the state to its last write, and leaves the event to `put` while `owner` says
+that a thread changes the state in several steps. A clock that runs Python is left to `put` too.
+
 A KeyboardInterrupt can arrive at any call. The steps that write a record and update the bookkeeping make no calls, so
 either all or none of them happen. The header is written after the body: a body without a header does not decode. A kill
 between the two leaves a torn frame, which recovery truncates.
