@@ -642,7 +642,7 @@ class FailureCopies:
         self, failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
     ) -> FailureValue:
         """Copy as `failure_value` does. Raises no `Exception`."""
-        if not isinstance(failure, BaseException):  # whatever an executive gave
+        if not issubclass(type(failure), BaseException):  # whatever an executive gave, which may deny its class
             return failure_value(failure, references, convert)
         arguments, message = _ARGS(failure), message_of(failure)
         if self._last is not None:
