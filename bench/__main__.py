@@ -63,7 +63,6 @@ RUNS = (
     Run("others", middle=("--events", "20000", "--turns", "2")),
     Run("daemon", middle=()),
     Run("daemon postgresql", _POSTGRESQL, middle=_POSTGRESQL),
-    Run("behaviour_trees"),
     Run("recall", middle=("--no-soar", "--actions", "100000")),
     Run("recall, large", ("--no-soar", "--actions", "10000000"), quick=False),
     Run("cases"),

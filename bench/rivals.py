@@ -283,7 +283,7 @@ async def costs(names: list[str], *, turns: int, actions: int) -> dict[str, dict
     with tempfile.TemporaryDirectory(prefix="b") as folder:
         async with AsyncExitStack() as stack:
             ways = {}
-            for number, name in enumerate(names):
+            for number, name in enumerate(reversed(names)):  # the memory opened last records the plan
                 (place := Path(folder) / str(number)).mkdir()
                 ways[name] = await RIVALS[name].open(stack, place)
             gc.collect()
