@@ -337,10 +337,14 @@ def _fault_in(projection: Projection) -> str | None:
 #
 # Two batches may be folded at a time, one while the other is written in parts. They never share a fold, because a fold
 # is in the cache or in one batch.
+#
+# Projections without a state have a cache too, of the sequences alone. It shows which events of a batch of the tables
+# a projection can fold in the same pass (`pipeline`): those of episodes that the projection left where the batch begins.
 
 _EPISODES_MAX: Final = 1_000
-"""Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch (400).
-With more open episodes than this, those that were not folded for the longest time are read from their start again."""
+"""Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch of a
+projection (400). With more open episodes than this, those that were not folded for the longest time are read from their
+start again."""
 _PAGE_EVENTS: Final = 2_000
 """Bounds the events that are read at once to restore a fold."""
 _ENDED: Final = EpisodeEnded.__name__
