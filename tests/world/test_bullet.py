@@ -355,7 +355,7 @@ def run(code: str) -> subprocess.CompletedProcess[bytes]:
 def test_importing_the_package_does_not_import_bullet_or_numpy() -> None:
     done = run(
         "import sys, pycrorm_async.world as world\n"
-        "bullets = {'pybullet', 'pycram_bullet', 'optik'}\n"
+        "bullets = {'pybullet', 'pycram_bullet', 'mujoco', 'optik'}\n"
         "world.Pose, world.ObjectType\n"
         "print(bullets & set(sys.modules), 'numpy' in sys.modules)\n"
         "world.BulletWorld, world.Object, world.OccupancyCostmap\n"
@@ -382,7 +382,7 @@ def test_nothing_of_bullet_reaches_stdout_or_stderr_and_those_of_c_and_cpp_are_t
         "from pycrorm_async.world.pose import DescriptionNotLoadable\n"
         "print('before')\n"
         'link = \'<robot name="a"><link name="l"><collision><geometry>{}</geometry></collision></link></robot>\'\n'
-        "with BulletWorld(), tempfile.NamedTemporaryFile(suffix='.stl') as empty:\n"
+        "with BulletWorld(engine='bullet'), tempfile.NamedTemporaryFile(suffix='.stl') as empty:\n"
         "    Object('pr2', ObjectType.ROBOT)\n"
         "    Object('kitchen', ObjectType.ENVIRONMENT)\n"
         "    Object('bare', ObjectType.GENERIC_OBJECT, link.format('<box size=\"1 1 1\"/>'))\n"

@@ -28,6 +28,7 @@ from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import AttachmentRefused, DescriptionNotLoadable, JointLimitExceeded, WorldUnavailable
 from pycrorm_async.world.queries import Camera, collisions_at, photograph
 from pycrorm_async.world.world_copy import counterpart
+from tests import mesh_files
 from tests.world.box_engine import BoxEngine
 from tests.world.fakes import crane_links, matrix
 
@@ -406,7 +407,7 @@ def mesh_file(path: Path) -> Path:
     if path.stem == "flat":
         path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
     elif path.suffix == ".dae":
-        path.write_bytes(trimesh.exchange.dae.export_collada(trimesh.creation.box((1, 1, 1))))
+        path.write_bytes(mesh_files.collada())
     else:
         trimesh.creation.box((1, 1, 1)).export(path)
     return path

@@ -331,8 +331,7 @@ class _Scene:
         name = f"{id(triangles)}"
         mesh, count = self._meshes.get(id(triangles), (None, 0))
         if mesh is None:
-            mesh = self._spec.add_mesh(name=name, uservert=triangles.vertices, userface=triangles.faces)
-            mesh.inertia = self._library.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            mesh = _add_mesh(self._spec, name, triangles.vertices, triangles.faces)
         self._meshes[id(triangles)] = mesh, count + 1
         elements.meshes.append(triangles)
         return name
@@ -487,10 +486,10 @@ _NONE = np.zeros(0, np.int64)
 
 
 class _Triangles(NamedTuple):
-    """The vertices of a mesh, x, y, z in one list, and its triangles."""
+    """The vertices of a mesh, m, (n, 3), and for each triangle the indices of its vertices, (m, 3)."""
 
-    vertices: list[float]
-    faces: list[int]
+    vertices: NDArray[np.float32]
+    faces: Numbers
 
 
 def _geom(shape: Shape, color: Color) -> _Geom:
@@ -541,6 +540,8 @@ def _color(shape: Shape) -> Color:
 @lru_cache(maxsize=512)
 def _hull(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangles:
     """Return the convex hull of a mesh file's points; a flat one is made 1 mm thick. Raises `ValueError`."""
+    if not all(map(math.isfinite, scale)):
+        raise ValueError(f"mesh {path}: its scale is not finite")
     points = mesh_points(path) * scale
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=True)
@@ -548,23 +549,22 @@ def _hull(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangle
         along = (points - middle) @ axis
         if (lack := _THIN_M - float(np.ptp(along))) > 0:
             points = np.concatenate([points - axis * lack / 2, points + axis * lack / 2])
-    return _compiled(path, points.ravel().tolist(), [])
+    return _compiled(path, points, np.zeros((0, 3), np.int32))
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=128)
 def _surface(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangles:
     """Return the triangles of a mesh file as they are. Raises `ValueError`."""
     mesh = read_mesh(path, Path(path).read_bytes())
-    return _compiled(path, (mesh.vertices * scale).ravel().tolist(), mesh.faces.ravel().tolist())
+    return _compiled(path, mesh.vertices * scale, mesh.faces)
 
 
-def _compiled(path: str, vertices: list[float], faces: list[int]) -> _Triangles:
-    """Return the triangles that MuJoCo makes of a mesh: the hull's without faces. Raises `ValueError`."""
+def _compiled(path: str, vertices: Floats, faces: NDArray[Any]) -> _Triangles:
+    """Return the triangles that MuJoCo makes of a mesh; without faces, those of the hull. Raises `ValueError`."""
     mujoco = library()
     spec = mujoco.MjSpec()
     spec.compiler.usethread = False
-    mesh = spec.add_mesh(name="mesh", uservert=vertices, userface=faces)
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    _add_mesh(spec, "mesh", vertices, faces)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0)
     try:
         model = spec.compile()
@@ -573,8 +573,14 @@ def _compiled(path: str, vertices: list[float], faces: list[int]) -> _Triangles:
         raise ValueError(f"mesh {path}: MuJoCo cannot use it: {reason}") from error
     w, x, y, z = model.mesh_quat[0]
     points = model.mesh_vert.astype(np.float64) @ rotation_matrix((x, y, z, w)).T + model.mesh_pos[0]
-    used, faces_of_used = np.unique(model.mesh_face, return_inverse=True)
-    return _Triangles(points[used].ravel().tolist(), faces_of_used.ravel().tolist())
+    used, corners = np.unique(model.mesh_face, return_inverse=True)
+    return _Triangles(points[used].astype(np.float32), corners.reshape(-1, 3).astype(np.int32))
+
+
+def _add_mesh(spec: Any, name: str, vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
+    mesh = spec.add_mesh(name=name, uservert=vertices.ravel().tolist(), userface=faces.ravel().tolist())
+    mesh.inertia = library().mjtMeshInertia.mjMESH_INERTIA_SHELL  # the others refuse open surfaces
+    return mesh
 
 
 # === library ==================================================================================================
