@@ -339,7 +339,7 @@ def _fault_in(projection: Projection) -> str | None:
 # is in the cache or in one batch.
 #
 # Projections without a state have a cache too, of the sequences alone. It shows which events of a batch of the tables
-# a projection can fold in the same pass (`pipeline`): those of episodes that the projection left where the batch begins.
+# a projection can fold in the same pass (`pipeline`): those of episodes that it left where the batch begins.
 
 _EPISODES_MAX: Final = 1_000
 """Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch of a
