@@ -94,16 +94,20 @@ class Parts:
         """The past actions of the database and of this process."""
         if self._made_recall is None:
             with self._lock:
-                running = recalling.ProcessCases(
-                    self.emitter,
-                    open_episodes=lambda: [*self.episodes.by_id],
-                    flush=self.flush,
-                    log=self.reading.log,
-                    clock=self._clock,
-                )
-                reader = recalling.CaseReader(recalling.DatabaseSource(self.reading), running)
-                self._made_recall = recalling.Recall(reader, self.reading, self._clock)
+                if self._made_recall is None:
+                    self._made_recall = self._make_recall()
         return self._made_recall
+
+    def _make_recall(self) -> Recall:
+        running = recalling.ProcessCases(
+            self.emitter,
+            open_episodes=lambda: [*self.episodes.by_id],
+            flush=self.flush,
+            log=self.reading.log,
+            clock=self._clock,
+        )
+        reader = recalling.CaseReader(recalling.DatabaseSource(self.reading), running)
+        return recalling.Recall(reader, self.reading, self._clock)
 
     @property
     def experience(self) -> PickUpExperience:

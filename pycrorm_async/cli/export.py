@@ -20,12 +20,12 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import ExportComparison, Exported, export_again, format_named, format_of
 from pycrorm_async.export.export import export as write_export
 from pycrorm_async.export.selection import read_manifest
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.named_queries import EpisodeChoice
 from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.questions import QUESTIONS, arguments_of
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import shared_address
 
 _READ: Mapping[Any, Callable[[str], Any]] = {
     bool: lambda text: {"true": True, "false": False}[text.lower()],

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 import typer
 
 from pycrorm_async.cli.output import note
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.queue.spool import Spool
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import DatabaseAddress, shared_address
 
 if TYPE_CHECKING:
     from pycrorm_async.query.reading import Reading

@@ -24,11 +24,11 @@ from pycrorm_async.events.codec import Record, declaration_type, decode, encode,
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
 from pycrorm_async.events.types import EVENT_TYPES, EpisodeTagged
-from pycrorm_async.operations.destination import LogAndTables, shared_address
+from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import DatabaseAddress, shared_address
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry

@@ -25,7 +25,7 @@ import msgspec
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseForeign, SpoolTaken
-from pycrorm_async.operations.destination import open_destination, shared_address
+from pycrorm_async.operations.destination import open_destination
 from pycrorm_async.operations.rebuild import rebuild_outdated
 from pycrorm_async.operations.workers import (
     Assignment,
@@ -41,7 +41,7 @@ from pycrorm_async.queue.sources import LiveSource, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool, folder_error
 from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import DatabaseAddress, shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
 from pycrorm_async.writer.drain import ClaimedSource, ScanResult, TablesPort

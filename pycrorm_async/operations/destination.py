@@ -292,14 +292,6 @@ async def _watch_file(log: EventLog) -> None:
         lost = loss is not None
 
 
-def shared_address(url: str | DatabaseAddress) -> DatabaseAddress:
-    """The address of a database that another process can open too. Raises `UnknownUrl`, `CallerError`."""
-    address = DatabaseAddress.parse(url) if isinstance(url, str) else url
-    if address.is_private:
-        raise errors.CallerError("sqlite:// exists only in its own process, no other can open it: name a file")
-    return address
-
-
 # === stored records ===========================================================================================
 #
 # Read stored records again: each recorder's kept segments and those still in its folder.

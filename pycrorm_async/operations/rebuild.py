@@ -13,7 +13,6 @@ from typing import NamedTuple
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.events.ids import is_episode_id
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.workers import Assignment, FoldWorker, FoldWorkerLost, FoldWorkers
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar
 from pycrorm_async.projections.custom import Projection
@@ -22,7 +21,7 @@ from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.pipeline import Share
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear, recorded
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
+from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress, shared_address
 from pycrorm_async.store.log import EventLog
 
 _log = logging.getLogger("pycrorm_async")

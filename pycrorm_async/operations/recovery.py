@@ -17,13 +17,14 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.operations.destination import open_destination, shared_address
+from pycrorm_async.operations.destination import open_destination
 from pycrorm_async.projections.custom import Projection, validate_projections
 from pycrorm_async.queue.maintenance import inspect_spool
 from pycrorm_async.queue.sources import DeadSource, LiveSource, open_dead
 from pycrorm_async.queue.spool import Spool, folder_error
 from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
+from pycrorm_async.store.address import shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import DrainSummary, Source, drain_once
 

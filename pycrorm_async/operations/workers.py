@@ -55,13 +55,13 @@ import msgspec
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable
-from pycrorm_async.operations.destination import LogAndTables, shared_address
+from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.projections.custom import Projection, installed_projections
 from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, BatchPreview, FoldRunner, LiveTarget, Share
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
+from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress, shared_address
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span

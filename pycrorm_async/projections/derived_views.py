@@ -32,8 +32,6 @@ from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ance
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.columns import EPISODE, LINK_BOX
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.model_boxes import link_boxes
-from pycrorm_async.world.models import built_in_model, built_in_urdf
 from pycrorm_async.world.pose import ObjectType
 
 #
@@ -760,6 +758,9 @@ def _built_in() -> sa.TextualSelect:
 
 
 def _built_in_rows() -> Iterator[tuple[str | float | None, ...]]:
+    from pycrorm_async.world.model_boxes import link_boxes  # with numpy, which only the creation of views needs
+    from pycrorm_async.world.models import built_in_model, built_in_urdf
+
     for kind in ObjectType:
         if kind not in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
             for box in link_boxes(built_in_urdf("any", kind)):

@@ -47,7 +47,7 @@ from pycrorm_async.query import frames
 from pycrorm_async.query.named_queries import EpisodeChoice, episode_list
 from pycrorm_async.query.question import CHECKED, AskedEpisode, QuestionPlan, classes_meant_by
 from pycrorm_async.query.text import nearest
-from pycrorm_async.record.samples import SAMPLES
+from pycrorm_async.record.values import SAMPLES
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 

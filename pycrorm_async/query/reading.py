@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 from weakref import ref
 
 from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event, func, select
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.dialects import registry
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
 from sqlalchemy.orm import ORMExecuteState, Session
@@ -262,7 +262,8 @@ class Reading:
     @property
     def dialect(self) -> Dialect:
         """The dialect of the database, to write a statement in its SQL."""
-        return sqlite.dialect() if self._address.is_sqlite else postgresql.dialect()  # type: ignore[no-untyped-call]
+        found: Dialect = registry.load("sqlite" if self._address.is_sqlite else "postgresql")()
+        return found
 
     async def rows(
         self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False

@@ -12,7 +12,8 @@ from pycrorm_async.orm import Observation, ObservationValue
 from pycrorm_async.query.question import AskedEpisode, episode_name
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
-from pycrorm_async.record.samples import SAMPLES, TIME, table_of
+from pycrorm_async.record.samples import TIME, table_of
+from pycrorm_async.record.values import SAMPLES
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,6 +20,7 @@ from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
+from pycrorm_async import world
 from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.ids import SLOT_NODE, row_id
@@ -32,8 +33,6 @@ from pycrorm_async.query.text import NotebookValue
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.visible_text import visible
-from pycrorm_async.world.body import ObjectState, WorldState
-from pycrorm_async.world.engines import engine_in
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
 
@@ -138,9 +137,11 @@ class WorldThen(NotebookValue):
         return tuple(AttachmentThen(to[0], name, to[1]) for name, to in pairs if to is not None)
 
     @property
-    def state(self) -> WorldState:
+    def state(self) -> world.WorldState:
         """The world's state for `BulletWorld.restore_state`."""
-        return WorldState({each.name: ObjectState(each.pose, each.joints, each.attached_to) for each in self.objects})
+        return world.WorldState(
+            {each.name: world.ObjectState(each.pose, each.joints, each.attached_to) for each in self.objects}
+        )
 
 
 @dataclass(frozen=True)
@@ -249,6 +250,8 @@ async def as_of(
     replay.dtypes = await log.dtypes()
     moment = await _moment_of(replay, log, meshes=meshes)
     line = replay.started.world or await _entered_world(log, row)
+    from pycrorm_async.world.engines import engine_in  # here, because it loads numpy
+
     return replace(moment, world=replace(moment.world, engine=engine_in(line or "")))
 
 

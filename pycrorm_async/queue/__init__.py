@@ -63,8 +63,17 @@ if its base is the next position. The oldest segment's header lists the open epi
 when the segments that began them are deleted: a segment is deleted only after the next one's header is on the disk.
 """
 
-from pycrorm_async.queue.recorder_queue import RecorderQueue
-from pycrorm_async.queue.sources import DeadSource, LiveSource, open_dead
-from pycrorm_async.queue.spool import RecorderFolder, Spool
+from typing import TYPE_CHECKING
+
+from pycrorm_async.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from pycrorm_async.queue.recorder_queue import RecorderQueue
+    from pycrorm_async.queue.sources import DeadSource, LiveSource, open_dead
+    from pycrorm_async.queue.spool import RecorderFolder, Spool
 
 __all__ = ["RecorderQueue", "LiveSource", "DeadSource", "open_dead", "Spool", "RecorderFolder"]
+__getattr__ = lazy_names(
+    __name__,
+    {"recorder_queue": "RecorderQueue", "sources": "DeadSource LiveSource open_dead", "spool": "RecorderFolder Spool"},
+)

@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Blob
-from pycrorm_async.record.values import clean, clean_repr, cut
+from pycrorm_async.record.values import SAMPLES, clean, clean_repr, cut
 
-SAMPLES: Final = "application/x-npy; samples"
-"""The media type of a block."""
 TIME: Final = "ns"
 """The column of a block with the times."""
 _NUMBERS_MAX: Final = 8_192

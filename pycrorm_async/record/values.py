@@ -391,6 +391,8 @@ ARRAY_ITEMS_MAX: Final = 64
 """Bounds the elements of an observed array that is recorded as JSON, each with a row of its own, as a joint state."""
 NPY: Final = "application/x-npy"
 """Media type of an array that is stored as a blob: `numpy.load(io.BytesIO(content))`."""
+SAMPLES: Final = "application/x-npy; samples"
+"""Media type of a block of samples (`record.samples`)."""
 _INTEGERS: Final = range(-(2**63), 2**63)
 _NUMBERS: Final = "biuf"
 """The dtype kinds of arrays whose elements JSON can hold."""

@@ -25,7 +25,7 @@ from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.ext.asyncio import AsyncEngine
 
-from pycrorm_async.errors import DatabaseUnavailable, UnknownUrl
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownUrl
 from pycrorm_async.store import postgresql_engine as postgresql
 from pycrorm_async.store import sqlite_engine as sqlite
 
@@ -236,3 +236,11 @@ def _lock(folder: Path) -> int:
         os.close(descriptor)
         raise
     return descriptor
+
+
+def shared_address(url: str | DatabaseAddress) -> DatabaseAddress:
+    """The address of a database that another process can open too. Raises `UnknownUrl`, `CallerError`."""
+    address = DatabaseAddress.parse(url) if isinstance(url, str) else url
+    if address.is_private:
+        raise CallerError("sqlite:// exists only in its own process, no other can open it: name a file")
+    return address

@@ -19,7 +19,6 @@ from sqlalchemy import Select, column, select, table
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.memory import Memory
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.rebuild import rebuild_projection
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
@@ -29,6 +28,7 @@ from pycrorm_async.query.again import names_in_rows
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings
+from pycrorm_async.store.address import shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 

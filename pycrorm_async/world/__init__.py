@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pycrorm_async.world.body import WorldState
+    from pycrorm_async.world.body import ObjectState, WorldState
     from pycrorm_async.world.bounding_boxes import BoundingBox
     from pycrorm_async.world.bullet import BulletWorld, Object, WorldObserver, WorldWatcher, current_world, watcher
     from pycrorm_async.world.pose import (
@@ -66,6 +66,7 @@ __all__ = [
     "JointType",
     "WorldMode",
     "WorldState",
+    "ObjectState",
     "BoundingBox",
     "Limits",
     "RobotDescription",

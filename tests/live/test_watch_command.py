@@ -22,7 +22,7 @@ from pycrorm_async.live.access import kept_token, refusal
 from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.live.server import PORT, listen
 from pycrorm_async.memory import Memory
-from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.store.address import shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 from pycrorm_async.world import Pose

@@ -113,3 +113,20 @@ async def test_the_class_of_a_type_is_found_before_the_first_query(tmp_path: Pat
             assert await memory.number_of(memory.recent_episodes[0]) == 1
         drive = memory.mapped("Drive")
         assert {"speed"} <= {*drive.__table__.c.keys()}
+
+
+COMMANDS = """
+import importlib
+
+verbs = "ask copy diff episodes events query rebuild schema show tag verify writer".split()
+for verb in verbs:
+    importlib.import_module(f"pycrorm_async.cli.{verb}")
+leaves = [each for each in ("pycrorm_async.orm.actions",) if each in sys.modules]
+unused = ("pycrorm_async.plan", "pycrorm_async.recall", "numpy", "pandas", "sqlalchemy.dialects.postgresql")
+print(json.dumps([*leaves, *loaded(*unused)]))
+"""
+
+
+@pytest.mark.slow
+def test_commands_that_read_or_move_events_load_no_numbers_plans_or_classes_of_types() -> None:
+    assert run(COMMANDS) == []
