@@ -317,7 +317,7 @@ class Record(NamedTuple):
 
     Attributes:
         position: 1, 2, 3 … over all records of one recorder.
-        episode: 16 bytes of a UUIDv7, or None.
+        episode: 16 bytes of a UUID, or None.
         sequence: 1, 2, 3 … inside the episode, without gaps; 0 without an episode.
         type: name of the event type, as in `pycrorm_async.events.types`.
         version: version of that type's shape.

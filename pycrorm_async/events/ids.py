@@ -1,6 +1,6 @@
 """Ids identify episodes, events and rows.
 
-A UUIDv7 identifies an episode, (episode, sequence) an event, and (episode number, sequence, slot) a row: the slot
+A UUID identifies an episode, (episode, sequence) an event, and (episode number, sequence, slot) a row: the slot
 distinguishes the rows of one event. A row id packs these three into 53 bits, so that data frames (float64 where a
 column is nullable) and JSON hold it exactly:
 

@@ -41,7 +41,7 @@ All numbers in segments are little endian, and every structure begins at a multi
     16      u64   sequence             in the episode     0                  records since the commit before
     24      i64   wall_ns              UTC, since 1970
     32      i64   monotonic_ns
-    40      16 s  episode              UUIDv7             zeros              zeros
+    40      16 s  episode              UUID               zeros              zeros
     56      u32   salt                 that of the segment
     60      u32   crc32 of the bytes after the header, with padding, continued over bytes 0 to 60
 

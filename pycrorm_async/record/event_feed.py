@@ -40,7 +40,7 @@ class RecordedEvent(NamedTuple):
     """An event that was recorded: it survives `kill -9`, and need not be in the database yet.
 
     Attributes:
-        episode: id of the episode, a UUIDv7 as text.
+        episode: id of the episode, a UUID as text.
         sequence: 1, 2, 3 … inside the episode; that of a NodeStarted is the node's id there.
         happening: one of `pycrorm_async.events.types`.
         dtype: the designator type of a NodeStarted; None for other events and for nodes without a type.

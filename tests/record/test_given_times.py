@@ -238,10 +238,21 @@ def test_a_source_that_has_changed_is_refused_in_one_line(tmp_path: Path) -> Non
     assert rows(tmp_path, "SELECT count(*) FROM event") == [(3,)]
 
 
-async def test_a_name_is_found_inside_a_running_loop(tmp_path: Path) -> None:
+async def test_a_name_and_its_samples_are_found_on_each_database_inside_a_loop(
+    database_url: str, tmp_path: Path
+) -> None:
     for turn in range(2):
-        async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
             assert record_drives(memory.recording, "drives.log", 3).is_recorded == (turn == 1)
+            with memory.recording.episode(id="joints.log", at=START) as episode:
+                episode.sampled("joints", ["a", "b"], [[1.5, 2.5]] * 3, [START, START + 1, START + SECOND])
+                episode.close(status="UNKNOWN", at=START + SECOND)
+            await memory.flush()
+            frame = await memory.samples("joints")
+            streams = await memory.ask.streams().rows()
+            assert frame["ns"].tolist() == [START, START + 1, START + SECOND]
+            assert [tuple(each)[1:4] for each in streams] == [("joints", 2, 3)]
+            assert [each.status for each in await memory.episodes()] == ["SUCCEEDED", "UNKNOWN"]
 
 
 def test_an_import_runs_beside_a_live_memory(tmp_path: Path) -> None:
