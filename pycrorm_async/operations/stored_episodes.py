@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from pycrorm_async.errors import FlushTimeout
-from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.ids import EpisodeId, is_named
 from pycrorm_async.queue.format import segment_numbers, segment_path
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
@@ -53,6 +53,7 @@ class LogEpisodes:
         self._queue = queue
         self._unrecoverable = unrecoverable
         self._timeout_s = timeout_s
+        self._asked: set[EpisodeId] = set()
 
     def find(self, episode: EpisodeId) -> StoredEpisode | None:
         """Implement `StoredEpisodes.find`. Raises `FlushTimeout` if another recorder keeps events of the episode."""
@@ -68,7 +69,10 @@ class LogEpisodes:
         )
 
     def _wait_until_stored(self, episode: EpisodeId) -> None:
-        position, deadline = self._queue.written, time.monotonic() + self._timeout_s
+        # The queue has no records of a named episode that was not asked for before, so an import of many need not wait.
+        is_new = is_named(episode) and episode not in self._asked
+        self._asked.add(episode)
+        position, deadline = 0 if is_new else self._queue.written, time.monotonic() + self._timeout_s
         others = [
             each.path
             for each in self._spool.recorders()  # without dead letters, which the log refuses again and again
