@@ -122,7 +122,9 @@ class Bullet:
     def load(self, name: str, model: Model) -> tuple[int, tuple[str, ...]]:
         """Load a model; the remarks are what Bullet printed, and the visual meshes that it does not draw."""
         number, remarks = _load(name, model, self.client)
-        self._bodies[number] = _Body(model, number, self.client)
+        self._bodies[number] = body = _Body(model, number, self.client)
+        if any(shape.kind == "mesh" for link in model.links.values() for shape in link.collisions):
+            _ = body.boxes  # while the files are those that Bullet has read
         return number, remarks
 
     def unload(self, number: int) -> None:
