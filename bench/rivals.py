@@ -262,7 +262,7 @@ RIVALS: Final = {
     "MCAP, flush": Rival(mcap, _count_mcap, "by time", "mcap"),
     "MCAP, chunks of 1 MiB": Rival(mcap_chunked, _count_mcap, "by time", "mcap"),
     "OpenTelemetry, batch exporter": Rival(
-        opentelemetry, lambda folder: 2 * _count_lines(folder), "by reading all", "opentelemetry"
+        opentelemetry, lambda folder: 2 * _count_lines(folder), "by reading all", "opentelemetry.sdk"
     ),
     "sqlite3, commit each": Rival(sqlite_autocommit, _rows("events.db", "event"), "SQL over JSON"),
     "persist-queue, SQLite": Rival(persist_queue, _rows("data.db", "queue_default"), "in order, once", "persistqueue"),
@@ -379,9 +379,10 @@ def measure(*, turns: int, actions: int, kills: int) -> dict[str, Any]:
 
 
 def _is_installed(name: str, rival: Rival) -> bool:
-    if rival.module is None or find_spec(rival.module.partition(".")[0]) is not None:
-        return True
-    console().print(f"  {name} is left out: pip install '.[bench]'")
+    with suppress(ModuleNotFoundError):  # raised if the package is missing that holds the module
+        if rival.module is None or find_spec(rival.module) is not None:
+            return True
+    console().print(f"  {name} is left out: pip install '.[bench]'", markup=False)
     return False
 
 
