@@ -256,7 +256,7 @@ def test_rays_meet_what_they_meet_among_boxes_also_from_inside_and_from_below(en
     assert "kitchen" not in of_boxes[1]
     for answer, right in zip(of_engine, of_boxes, strict=True):
         differing = sum(one != two for one, two in zip(answer, right, strict=True))
-        assert differing <= 0.004 * len(right)  # rays along an edge
+        assert differing <= 2  # rays of Bullet along an edge
     assert visible == pytest.approx(expected, abs=0.02)
 
 
