@@ -17,7 +17,7 @@ from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.imports.intake import ImportReport
-from pycrorm_async.imports.registry import format_names, import_files
+from pycrorm_async.imports.registry import BUILT_IN, format_names, import_files
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.reading import Reading
@@ -32,7 +32,9 @@ def import_(
     *,
     file_format: Annotated[
         str,
-        typer.Argument(metavar="FORMAT", help="The format of the files.", autocompletion=format_names),
+        typer.Argument(
+            metavar="FORMAT", help=f"The format of the files: {', '.join(BUILT_IN)}.", autocompletion=format_names
+        ),
     ],
     paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="The files or folders to import.")],
     map_file: Annotated[

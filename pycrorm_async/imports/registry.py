@@ -27,7 +27,7 @@ from pycrorm_async.record.recording import Recording
 
 GROUP: Final = "pycrorm.import_formats"
 """The group of the entry points of formats."""
-_BUILT_IN: Final = {
+BUILT_IN: Final = {
     "trace": "trace",
     "btlog": "btlog",
     "mcap": "bags",
@@ -41,13 +41,13 @@ _BUILT_IN: Final = {
 
 def format_names() -> list[str]:
     """Return the names of the built-in formats, and of those that installed packages offer."""
-    return [*_BUILT_IN, *sorted({each.name for each in entry_points(group=GROUP)} - _BUILT_IN.keys())]
+    return [*BUILT_IN, *sorted({each.name for each in entry_points(group=GROUP)} - BUILT_IN.keys())]
 
 
 def format_named(name: str) -> ImportFormat:
     """Return the format of this name. Raises `CallerError`."""
-    if name in _BUILT_IN:
-        built_in: ImportFormat = import_module(f"pycrorm_async.imports.{_BUILT_IN[name]}").FORMAT
+    if name in BUILT_IN:
+        built_in: ImportFormat = import_module(f"pycrorm_async.imports.{BUILT_IN[name]}").FORMAT
         return built_in
     offered = next(iter(entry_points(group=GROUP, name=name)), None)
     if offered is None:
