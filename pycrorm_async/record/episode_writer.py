@@ -243,22 +243,24 @@ class EpisodeWriter:
         robot: ActingRobot | None,
         missing: Mapping[str, str],
         *,
-        named: dict[str, Any] | None = None,
+        whole: dict[str, Any] | None = None,
         may_refuse: bool = False,
     ) -> int:
         """Write the start of a node and return its sequence. `missing` has the reason for each missing value.
 
-        `named` are the parameters with references to the poses that nodes around have. Raises `Unrecordable` if
-        `may_refuse` and the settings ask for it.
+        `whole` are the parameters for observers, with the poses that `parameters` names in nodes around. Raises
+        `Unrecordable` if `may_refuse` and the settings ask for it.
         """
         owner = declared.dtype
         if missing:
             self.emitter.note_missing(owner, missing, may_refuse=may_refuse)
         written = cast("RobotValue", robot.written) if robot is not None else None
-        event = NodeStarted(kind, parent, declared.fingerprint or None, named or parameters, written, self.simulated)
-        shown: dict[str, Any] = {} if robot is None else {"robot": robot.state}
-        if named is not None:
-            shown["parameters"] = parameters
+        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, written, self.simulated)
+        shown: dict[str, Any] = {}
+        if self.emitter.feed.observers:
+            shown = {} if robot is None else {"robot": robot.state}
+            if whole is not None:
+                shown["parameters"] = whole
         sequence = self.put(event, owner, may_refuse=may_refuse, shown=shown)
         self._open[sequence] = owner
         return sequence

@@ -21,11 +21,11 @@ from __future__ import annotations
 import inspect
 import math
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
 from functools import partial, wraps
-from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeAlias, TypeVar
+from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
 from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import (
@@ -51,8 +51,6 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectReference,
-    PoseReference,
-    PoseValue,
     RefusalValue,
     RobotValue,
     SeenValue,
@@ -63,6 +61,7 @@ from pycrorm_async.plan.execution import recorder as plan_observer
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.plan.task import TaskTreeNode, current_node
+from pycrorm_async.record import values
 from pycrorm_async.record.episode_writer import (
     UNAWAITED_MAX,
     ActingRobot,
@@ -85,11 +84,6 @@ current_episode: ContextVar[Episode | None] = ContextVar("current_episode", defa
 """The innermost episode opened in this context; it may be closed already."""
 
 
-KnownPoses: TypeAlias = tuple[tuple[PoseValue, PoseReference], ...]
-_POSES_MAX: Final = 8
-"""Bounds the poses of nodes around that a parameter is compared with: those of four levels, of two poses each."""
-
-
 class NodeRecord(NamedTuple):
     """The hooks' record of a running node, kept as `TaskTreeNode.record`.
 
@@ -105,7 +99,7 @@ class NodeRecord(NamedTuple):
     sequence: int
     implicit: bool
     outer_episode: Episode | None
-    poses: KnownPoses = ()
+    poses: values.KnownPoses = ()
 
 
 class Episode(EpisodeWriter):
@@ -122,6 +116,7 @@ class Episode(EpisodeWriter):
         super().__init__(recording.emitter, recording.episodes.new_id(), opening)
         self.task = current_task()
         self.world: WorldRecorder | None = None
+        self.frozen_poses: Final = values.FrozenPoses(Pose)
         self.faults: tuple[str, ...] = ()
         self.calls: Final = CalledPerforms(self._note_unawaited)
         self._entered_world: str | None = None
@@ -210,7 +205,6 @@ class Recorder:
         self._sampler = _sampler_of(emitter)
         self._kept: set[tuple[str, str]] = set()
         self._pose_fields: dict[type, tuple[tuple[str, int], ...]] = {}
-        """Name and slot of the fields of each type that are poses."""
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "__dtype__", "it")))
         """Performs called outside any episode."""
 
@@ -319,20 +313,19 @@ class Recorder:
             missing: dict[str, str] = {}
             parameters = read_parameters(designator, declared.fields, episode, missing)
             robot = episode.robot_state() if episode.world is not None else None
-            parent: NodeRecord | None = node.parent.record if node.parent is not None else None
-            poses = parent.poses if parent is not None and parent.episode is episode else ()
+            poses = _poses_around(node, episode)
             fields = self._pose_fields.get(kind)
             if fields is None:
-                fields = self._pose_fields[kind] = tuple(
-                    (each.name, each.slot) for each in declared.declaration.fields if each.type == "pose"
-                )
-            named = _with_references(parameters, fields, poses) if fields and poses else None
+                fields = self._pose_fields[kind] = values.pose_fields(declared.declaration.fields)
+            whole = dict(parameters) if emitter.feed.observers else None
+            if fields and poses:
+                values.name_known(parameters, fields, poses)
             above = episode.node_or_root(node.parent)
             sequence = episode.put_start(
-                declared, node.kind, above, parameters, robot, missing, named=named, may_refuse=True
+                declared, node.kind, above, parameters, robot, missing, whole=whole, may_refuse=True
             )
             if fields:
-                poses = (*poses, *_poses_in(named or parameters, fields, sequence, missing))[-_POSES_MAX:]
+                poses = values.with_own(poses, parameters, fields, sequence)
         except BaseException as error:
             if implicit is not None:
                 self.close_episode(implicit, error)
@@ -470,28 +463,9 @@ class Recorder:
             self._emitter.note_fault(event_type, error)
 
 
-def _with_references(
-    parameters: dict[str, Any], fields: tuple[tuple[str, int], ...], poses: KnownPoses
-) -> dict[str, Any] | None:
-    """Return the parameters with references to the known poses among them; None if there are none."""
-    named: dict[str, Any] = {}
-    for name, _ in fields:
-        pose = parameters.get(name)
-        for known, reference in poses:
-            if known == pose:
-                named[name] = reference
-                break
-    return parameters | named if named else None
-
-
-def _poses_in(
-    parameters: Mapping[str, Any], fields: tuple[tuple[str, int], ...], node: int, missing: Mapping[str, str]
-) -> Iterator[tuple[PoseValue, PoseReference]]:
-    """Yield the poses that this node was written with, each with a reference to it."""
-    for name, slot in fields:
-        pose = parameters.get(name)
-        if isinstance(pose, PoseValue) and name not in missing:
-            yield pose, PoseReference(node, name, slot)
+def _poses_around(node: TaskTreeNode, episode: Episode) -> values.KnownPoses:
+    record: NodeRecord | None = node.parent.record if node.parent is not None else None
+    return record.poses if record is not None and record.episode is episode else ()
 
 
 def observing() -> Recorder | None:
@@ -648,9 +622,7 @@ class WorldRecorder(ObjectRows[Object]):
         self.world = world
         self.sampled: dict[Object, dict[str, float]] = {}
         self._poses: dict[Object, tuple[Pose, BriefPose]] = {}
-        """The last recorded pose of each object, as the world has it and as a value."""
         self._acting: dict[Object, tuple[Pose, float | None, ObjectReference | None, ActingRobot]] = {}
-        """The robots' states at their last nodes, each with pose, torso height and row that it was made of."""
         for each in world.objects:
             self.object_added(each)
         for each in world.objects:

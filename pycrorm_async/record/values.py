@@ -41,6 +41,7 @@ from pycrorm_async.events.types import (
     MissingValue,
     ObjectReference,
     ObjectValue,
+    PoseReference,
     PoseValue,
 )
 from pycrorm_async.recorded_names import recorded_name
@@ -52,6 +53,10 @@ DEPTH_MAX = 8
 """Bounds the nesting of a value, of a failure's arguments and of exception groups."""
 ITEMS_MAX = 2**19
 """Bounds the items of one value. An item takes at least two bytes, so more exceed the default `record_bytes_max`."""
+
+
+_FROZEN_MAX = 32
+"""Bounds the poses whose copies an episode keeps: those of an action and of the nodes inside it."""
 
 
 class UnrecordableValue(ValueError):
@@ -123,6 +128,59 @@ def pose_value(pose: PoseLike) -> PoseValue:
 def brief_pose(pose: PoseLike) -> BriefPose:
     """Copy a pose for a field of an event whose type is a pose."""
     return BriefPose.of(pose_value(pose))
+
+
+class FrozenPoses:
+    """The copies of the poses that an episode recorded last, for a class of poses whose objects never change."""
+
+    def __init__(self, kind: type) -> None:
+        self._kind = kind
+        self._copies: dict[int, tuple[Any, PoseValue]] = {}
+
+    def get(self, pose: object) -> PoseValue | None:
+        """Return the copy of this very object; None if it has none, or may change."""
+        copy = self._copies.get(id(pose))
+        return copy[1] if copy is not None and copy[0] is pose else None
+
+    def keep(self, pose: PoseLike) -> PoseValue:
+        """Copy a pose."""
+        value = pose_value(pose)
+        if type(pose) is self._kind:
+            if len(self._copies) >= _FROZEN_MAX:
+                self._copies.clear()
+            self._copies[id(pose)] = pose, value
+        return value
+
+
+KnownPoses: TypeAlias = tuple[tuple[PoseValue, PoseReference], ...]
+"""The poses in parameters of a node and of those around it, each with a reference to it."""
+_KNOWN_MAX: Final = 8
+"""Bounds the poses that a parameter is compared with: those of four levels of nodes, of two poses each."""
+
+
+def pose_fields(fields: Iterable[FieldDeclared]) -> tuple[tuple[str, int], ...]:
+    """Return name and slot of the fields that are poses."""
+    return tuple((each.name, each.slot) for each in fields if each.type == "pose")
+
+
+def name_known(parameters: dict[str, Any], fields: tuple[tuple[str, int], ...], poses: KnownPoses) -> None:
+    """Replace the known poses among the parameters with references to them."""
+    for name, _ in fields:
+        pose = parameters.get(name)
+        for known, reference in poses:
+            if known is pose:
+                parameters[name] = reference
+                break
+
+
+def with_own(
+    poses: KnownPoses, parameters: Mapping[str, Any], fields: tuple[tuple[str, int], ...], node: int
+) -> KnownPoses:
+    """Return the known poses with those that this node was written with."""
+    for name, slot in fields:
+        if type(pose := parameters.get(name)) is PoseValue:
+            poses = (*poses[1 - _KNOWN_MAX :], (pose, PoseReference(node, name, slot)))
+    return poses
 
 
 def encoder_of(field: FieldDeclared) -> Encoder:
@@ -266,7 +324,10 @@ def _encode_member(value: Any, enum: type[Enum] | None, references: References) 
     return writable if type(writable) is str else str(writable)
 
 
-def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
+def _encode_pose(value: Any, _enum: type[Enum] | None, references: References) -> PoseValue:
+    frozen: FrozenPoses | None = getattr(references, "frozen_poses", None)
+    if frozen is not None and (known := frozen.get(value)) is not None:
+        return known
     is_copied = isinstance(value, PoseValue)
     if not is_copied and recorded_as(type(value)) != "pose":
         raise _mismatch("Pose", value)
@@ -277,7 +338,7 @@ def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) 
     except UnrecordableValue as reason:
         raise UnrecordableValue(f"the pose's frame: {reason}") from None
     if not is_copied:
-        return pose_value(value)
+        return pose_value(value) if frozen is None else frozen.keep(value)
     if (len(value.position), len(value.orientation)) != (3, 4):
         raise UnrecordableValue(f"a position has 3 numbers and an orientation 4: {value}")
     copied: PoseValue = value

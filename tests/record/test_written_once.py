@@ -35,7 +35,7 @@ from pycrorm_async.projections.columns import COLUMNS
 from pycrorm_async.projections.fold import fold_happening, happening_of
 from pycrorm_async.projections.row_batch import Designators, Row, Rows
 from pycrorm_async.record.episode_writer import fitted
-from pycrorm_async.record.values import NO_REFERENCES, FailureCopies, failure_value
+from pycrorm_async.record.values import NO_REFERENCES, FailureCopies, FrozenPoses, failure_value
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.projections.event_script import Script
 from tests.record.fakes import NoteActionPerformable, RecorderCase, recorder_case
@@ -173,6 +173,20 @@ def test_a_brief_pose_omits_what_is_exactly_the_default(pose: PoseValue, payload
     assert isinstance(read, NodeStarted)
     assert read.robot is not None
     assert repr(read.robot.pose) == repr(pose)
+
+
+def test_only_poses_of_the_class_whose_objects_never_change_are_copied_once() -> None:
+    class Placed(Pose):
+        """A class of a user, whose objects may change."""
+
+    poses, pose, placed = FrozenPoses(Pose), Pose([1, 0, 0]), Placed([1, 0, 0])
+    value = poses.keep(pose)
+    assert poses.get(pose) is value
+    assert poses.keep(placed).position == value.position
+    assert poses.get(placed) is None
+    for x in range(40):
+        poses.keep(Pose([x, 0, 0]))
+    assert poses.get(pose) is None
 
 
 # --- failures -----------------------------------------------------------------------------------------------------
