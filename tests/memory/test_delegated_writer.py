@@ -76,7 +76,7 @@ async def test_the_daemon_may_start_before_the_database_exists(tmp_path: Path, s
         assert not (tmp_path / "memory.db").exists()
         with pytest.raises(DatabaseUnavailable, match="does not exist"):
             await texts(memory)
-        with pytest.raises(CallerError, match="open a session first"):
+        with pytest.raises(DatabaseUnavailable, match="does not exist"):
             memory.mapped(NoteActionPerformable)
         started = Daemon(url, spool)
         await memory.flush()
