@@ -1,7 +1,7 @@
 """Run every script of `bench`, each in its own process, one after the other, and collect the figures.
 
     python -m bench                            a few hours, on a quiet machine; writes bench/figures
-    python -m bench --middle                   every comparison with fewer nodes and turns, about ten minutes
+    python -m bench --middle                   every comparison with fewer nodes and turns, in minutes
     python -m bench --quick                    a short run of every script, to check that it works
     python -m bench --only thesis --only questions,  a run by its name, or all whose names begin with this
     python -m bench --tables                   print the tables of bench/README.md from the figures; runs nothing
