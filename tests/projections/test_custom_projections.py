@@ -180,7 +180,8 @@ async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
         monkeypatch.setattr(custom, name, 1e9)
     begun = [each for number in (1, 2, 3) for each in tries(number).records[:4]]
     projector = await folded(log, [*declarations(PICK_UP), *begun], GraspRate())
-    await log.append([*tries(1).records, *tries(2).records, *tries(3).records])
+    # A process that folds the memory's own tables only leaves all three behind.
+    await folded(log, [*tries(1).records, *tries(2).records, *tries(3).records])
     while await projector.fold_next_batch():
         pass
     assert await visible_rows(log) == [rows_of(1)[0], rows_of(2)[0], *rows_of(3)]
@@ -277,7 +278,7 @@ async def test_the_reason_why_a_process_stops_folding_it_remains_until_the_proje
     assert state.fault is not None
     assert state.fault.startswith("a process stopped folding the projection grasp_rate")
     assert "is missing in" in state.fault
-    assert state.behind == len(records)
+    assert state.behind == len(records) - 3  # without those before the missing one
     await Projector(log, projections=[GraspRate()]).open()
     (state,) = await states(log, [GraspRate()])
     assert state.fault is None
