@@ -20,7 +20,8 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError, DatabaseForeign
 from pycrorm_async.operations.workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections import generations
-from pycrorm_async.projections.custom import ProjectionState, installed_projections, states
+from pycrorm_async.projections.custom import installed_projections
+from pycrorm_async.projections.custom_tables import ProjectionState, states
 from pycrorm_async.projections.generations import failed_views
 from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
 from pycrorm_async.queue.maintenance import inspect_recorder

@@ -16,7 +16,8 @@ from sqlalchemy import text
 from pycrorm_async.errors import CallerError, DatabaseForeign
 from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import next_number
-from pycrorm_async.projections.custom import CustomTables, Projection
+from pycrorm_async.projections.custom import Projection
+from pycrorm_async.projections.custom_tables import CustomTables
 from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
 from pycrorm_async.projections.pipeline import FoldRunner, LiveTarget, sweep
 from pycrorm_async.store.dialects import dialect_of

@@ -35,7 +35,7 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
-from pycrorm_async.projections import custom, pipeline
+from pycrorm_async.projections import custom, custom_tables, pipeline
 from pycrorm_async.projections.columns import CORE, OF_NO_EPISODE, next_number, physical_name
 from pycrorm_async.projections.generations import (
     MAKING,
@@ -117,8 +117,8 @@ class Rebuild:
         self._place = pipeline.place_of(generation.number, name)
         key = f"{self._key}{_MAKING}"
         self._making = SideTarget(log, key, name, generation.version, number=generation.number, share=share)
-        learn = learn_tables if projection is None else custom.learner_of(projection)
-        batch_events = _BATCH_EVENTS if projection is None else custom.events_of_batch(projection, _BATCH_EVENTS)
+        learn = learn_tables if projection is None else custom_tables.learner_of(projection)
+        batch_events = _BATCH_EVENTS if projection is None else custom_tables.events_of_batch(projection, _BATCH_EVENTS)
         self._runner = FoldRunner(self._making, learn, batch_events=batch_events)
 
     @classmethod
@@ -306,13 +306,13 @@ async def _begin_projection(
     tables = await current_generation(connection)
     if tables is None:
         raise DatabaseForeign("the database has no tables yet: run `pycrorm rebuild` without a name")
-    layout = custom.layout_of(projection, connection.dialect)
-    custom.refuse_taken(projection.name, layout, tables.layout, projections_in(generations))
+    layout = custom_tables.layout_of(projection, connection.dialect)
+    custom_tables.refuse_taken(projection.name, layout, tables.layout, projections_in(generations))
     key = f"{PROJECTION}{projection.name}"
     making = await _resumable(
         connection, generations, key, lambda each: each.version == projection.version and each.layout == layout
     )
-    return making or await custom.make_projection_tables(connection, projection, f"{key}{_MAKING}")
+    return making or await custom_tables.make_projection_tables(connection, projection, f"{key}{_MAKING}")
 
 
 # === replaced tables ==========================================================================================

@@ -15,7 +15,7 @@ from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, Happening, ObjectAdded, references_in
-from pycrorm_async.projections import custom, findings, fold, pipeline
+from pycrorm_async.projections import custom, custom_tables, findings, fold, pipeline
 from pycrorm_async.projections.columns import OWN, Layout, unite
 from pycrorm_async.projections.generations import (
     Generation,
@@ -687,7 +687,10 @@ async def uncompared_projections(log: EventLog, projections: Sequence[custom.Pro
     for name, each in generations.items():
         fault = "its code is not installed here"
         if name in by_name:
-            fault = custom.fault_in_version(by_name[name], each, custom.layout_of(by_name[name], dialect)) or ""
+            fault = (
+                custom_tables.fault_in_version(by_name[name], each, custom_tables.layout_of(by_name[name], dialect))
+                or ""
+            )
         if fault:
             reasons[name] = fault
     return reasons
@@ -722,7 +725,7 @@ class ProjectionCheck:
         clauses = "WHERE id >= :first AND id < :end"
         checkpoints = await connection.execute(text(f"SELECT id, folded FROM {place} {clauses}"), part.limits)  # noqa: S608
         self._folded = {each.id: each.folded for each in checkpoints}
-        learn = custom.learner_of(self._projection)
+        learn = custom_tables.learner_of(self._projection)
         batch = learn(generation.layout, await dialect.declarations(connection))[1]
         self._comparison, self._part, self._rows = comparison, part, batch()
         self._refused, self._lost = {}, set()

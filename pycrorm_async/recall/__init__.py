@@ -9,10 +9,15 @@ if TYPE_CHECKING:
     from pycrorm_async.recall.experience import PickUpExperience as PickUpExperience
     from pycrorm_async.recall.recall import CaseReader as CaseReader
     from pycrorm_async.recall.recall import DatabaseSource as DatabaseSource
-    from pycrorm_async.recall.recall import ProcessCases as ProcessCases
     from pycrorm_async.recall.recall import Recall as Recall
+    from pycrorm_async.recall.running_cases import ProcessCases as ProcessCases
 
 __getattr__ = lazy_names(
     __name__,
-    {"answer": "Answer", "experience": "PickUpExperience", "recall": "CaseReader DatabaseSource ProcessCases Recall"},
+    {
+        "answer": "Answer",
+        "experience": "PickUpExperience",
+        "recall": "CaseReader DatabaseSource Recall",
+        "running_cases": "ProcessCases",
+    },
 )

@@ -722,7 +722,9 @@ class RecordedEpisode(EpisodeWriter):
             self.emitter.note_fault("EpisodeStarted", error)
             if is_added:
                 self._episodes.by_id.pop(self.id, None)
-            self.closed, self.refusal = True, message_of(error)
+            self.closed = True
+            if is_named(self.id):  # of any other episode the calls that are lost are counted
+                self.refusal = message_of(error)
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
         """Write the end of the episode; leave a named one that is interrupted without an end."""

@@ -22,7 +22,8 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.operations.rebuild import rebuild_projection
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.custom import Projection, columns_of, states
+from pycrorm_async.projections.custom import Projection, columns_of
+from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.again import names_in_rows
 from pycrorm_async.query.reading import Reading

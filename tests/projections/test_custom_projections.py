@@ -27,7 +27,8 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections import custom, pipeline
-from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection, learner_of, states
+from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection
+from pycrorm_async.projections.custom_tables import learner_of, states
 from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.projections.generations import PROJECTION

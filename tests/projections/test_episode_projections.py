@@ -24,8 +24,8 @@ from pycrorm_async.projections.custom import (
     Event,
     Projection,
     own_projections,
-    states,
 )
+from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify

@@ -28,7 +28,7 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.projections.columns import Layout
-from pycrorm_async.projections.custom import learner_of
+from pycrorm_async.projections.custom_tables import learner_of
 from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.recall.blocks import Block
 from pycrorm_async.recall.cases import CaseBatch, CaseProjection

@@ -31,7 +31,8 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory, rebuild_projection
 from pycrorm_async.projections import pipeline
-from pycrorm_async.projections.custom import own_projections, states
+from pycrorm_async.projections.custom import own_projections
+from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.projections.projector import Projector
@@ -147,7 +148,7 @@ async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
 async def test_cases_are_folded_at_intervals_unless_a_caller_waits_for_them(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.custom._CHECK_S", 60.0)
+    monkeypatch.setattr("pycrorm_async.projections.custom_tables._CHECK_S", 60.0)
     script = CaseScript()
     await log.append([*TYPES, *script.records])
     projector = await projector_of(log)

@@ -18,7 +18,8 @@ from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisod
 from pycrorm_async.recall import recall as running_cases
 from pycrorm_async.recall.answer import Answer, Relation
 from pycrorm_async.recall.columns import Case
-from pycrorm_async.recall.recall import ProcessCases, Recall
+from pycrorm_async.recall.recall import Recall
+from pycrorm_async.recall.running_cases import ProcessCases
 from pycrorm_async.world import Arms
 from tests.recall.sliding_grips import (
     FETCH,
