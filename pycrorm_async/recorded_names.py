@@ -30,7 +30,7 @@ _MOVED: Final = {
     ("store.postgresql.errors", "store.postgresql_errors"): "CommitInDoubt",
     ("world.enums", "world.pose"): "Arms Grasp GripperState JointType ObjectType WorldMode",
     ("world.errors", "world.pose"): """
-        AttachmentRefused CostmapMismatch DescriptionNotLoadable DuplicateName
+        AttachmentRefused BulletMissing CostmapMismatch DescriptionNotLoadable DuplicateName
         JointLimitExceeded NoWorld ObjectNotInWorld ObjectRefused PoseRefused UnknownJoint UnknownLink
         WorldClosed WorldError WorldUnavailable
     """,

@@ -14,16 +14,7 @@ import typer
 from rich.text import Text
 from rich.tree import Tree
 
-from pycrorm_async.cli.output import (
-    EpisodeArgument,
-    JsonOption,
-    moment,
-    note,
-    print_facts,
-    print_json,
-    print_table,
-    stdout,
-)
+from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import BLOB_KEY
@@ -42,7 +33,7 @@ _DIGITS_MAX = 12
 
 def show(
     *,
-    episode: EpisodeArgument,
+    episode: output.EpisodeArgument,
     at: Annotated[
         str | None,
         typer.Option(
@@ -61,7 +52,7 @@ def show(
         ),
     ] = False,
     place: Place,
-    as_json: JsonOption = False,
+    as_json: output.JsonOption = False,
 ) -> None:
     """Show an episode's task tree with statuses and durations; with --at, tree and world at one moment."""
     if at is None:
@@ -86,13 +77,13 @@ def _show(episode: str, place: Place, *, events: bool, full: bool, as_json: bool
 
     summary, tree, (percepts, places) = place.read(query)
     if as_json:
-        print_json({"episode": summary, "tree": tree, "percepts": percepts, "places": places})
+        output.print_json({"episode": summary, "tree": tree, "percepts": percepts, "places": places})
         return
-    print_facts(
+    output.print_facts(
         f"Episode {summary.number}: {summary.description}",
         {
             "id": summary.id,
-            "started": f"{moment(summary.started_at)} UTC",
+            "started": f"{output.moment(summary.started_at)} UTC",
             "by": summary.created_by,
             "took": duration(summary.duration_ns),
             "events": summary.end_sequence,
@@ -137,7 +128,7 @@ def _show_moment(episode: str, at: str, place: Place, *, events: bool, full: boo
     time, sequence = parse_moment(at, "--at")
     snapshot = place.read(lambda reading: reading.as_of(episode, time=time, sequence=sequence))
     if as_json:
-        print_json(snapshot)
+        output.print_json(snapshot)
     else:
         print_snapshot(snapshot, at if sequence is not None else f"{time:g} s", events=events, full=full)
 
@@ -158,13 +149,14 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
     With `full` no text is cut and no number rounded, and the objects have their orientations, their colours and the
     fingerprints of their descriptions.
     """
-    print_facts(
+    at = output.moment(snapshot.at)
+    output.print_facts(
         f"Episode {snapshot.number}: {snapshot.description}",
         {
             "id": snapshot.id,
-            "started": f"{moment(snapshot.started_at)} UTC",
+            "started": f"{output.moment(snapshot.started_at)} UTC",
             "by": snapshot.created_by,
-            "at": (f"{requested}: after event {snapshot.sequence}, {snapshot.time_s:.6f} s, {moment(snapshot.at)} UTC"),
+            "at": f"{requested}: after event {snapshot.sequence}, {snapshot.time_s:.6f} s, {at} UTC",
             "status": snapshot.status,
             "simulated": "yes" if snapshot.simulated else None,
             "running": _running_text(snapshot),
@@ -174,14 +166,14 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
     print_tree(snapshot.tree, events=events, full=full)
     if snapshot.world.objects:
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
-        print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
+        output.print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
         if full:
-            print_table(
+            output.print_table(
                 "Shapes", ("object", "orientation", "color", "description"), map(_shape_row, snapshot.world.objects)
             )
     if snapshot.observations:
         observed = [_observed_row(name, each, full=full) for name, each in snapshot.observations.items()]
-        print_table("Observations", ("name", "at", "event", "values"), observed)
+        output.print_table("Observations", ("name", "at", "event", "values"), observed)
     latest = slice(None) if full else slice(-_LATEST_MAX, None)
     print_percepts(snapshot.percepts[latest], "Latest percepts")
     print_places(snapshot.places[latest], "Latest searches for places")
@@ -191,7 +183,7 @@ def print_percepts(percepts: Sequence[Percept], title: str = "Percepts") -> None
     """Print a table of percepts; nothing without any."""
     if percepts:
         columns = ("event", "node", "percept", "type", "x", "y", "z", "source", "confidence", "visible", "object")
-        print_table(title, columns, map(_percept_row, percepts))
+        output.print_table(title, columns, map(_percept_row, percepts))
 
 
 def _percept_row(each: Percept) -> tuple[object, ...]:
@@ -205,7 +197,7 @@ def print_places(places: Sequence[PlaceSearch], title: str = "Searches for place
     """Print a table of searches for places; nothing without any."""
     if places:
         columns = ("event", "node", "location", "considered", "offered", "taken", "refused")
-        print_table(title, columns, map(_search_row, places))
+        output.print_table(title, columns, map(_search_row, places))
 
 
 def _search_row(each: PlaceSearch) -> tuple[object, ...]:
@@ -305,15 +297,15 @@ def print_tree(nodes: Sequence[named_queries.NodeSummary], *, events: bool = Fal
     unless `full` is True. Many nodes are printed as plain lines.
     """
     if len(nodes) > _DRAWN_MAX:
-        lines = plain_lines(nodes, events=events, full=full, ascii_only=stdout.options.ascii_only)
+        lines = plain_lines(nodes, events=events, full=full, ascii_only=output.stdout.options.ascii_only)
         sys.stdout.writelines(f"{line}\n" for line in lines)
-        note(
+        output.note(
             f"{len(nodes):,} nodes, more than {_DRAWN_MAX:,}: no colours, no line breaks (`pycrorm report` draws them)"
         )
         return
     root = tree_of(nodes, events=events, full=full)
     if root is not None:
-        stdout.print(root)
+        output.stdout.print(root)
 
 
 def tree_of(

@@ -13,18 +13,9 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan import failures, geometry, objects
+from pycrorm_async.plan import failures, geometry, locations, objects
 from pycrorm_async.plan.execution import Refusal
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.locations import (
-    Location,
-    LocationDesignator,
-    PlaceReach,
-    base_clearance,
-    base_height_m,
-    reaching_arms,
-    resolve_robot,
-)
 from pycrorm_async.plan.task import Experience, PastSuccess, experience
 from pycrorm_async.world import queries
 from pycrorm_async.world.bullet import Object
@@ -70,7 +61,7 @@ class DatabaseCostmapLocation:
         if self.reachable_arm is Arms.BOTH:
             raise CallerError("a pick-up uses one arm: reachable_arm must be LEFT, RIGHT, or None for either of them")
 
-    async def resolve(self) -> Location | None:
+    async def resolve(self) -> locations.Location | None:
         """Return the place with the best experience; None if no past success is usable in the current scene."""
         places = iter(await self.remembered())
         try:
@@ -78,11 +69,11 @@ class DatabaseCostmapLocation:
         finally:
             places.close()
 
-    def __aiter__(self) -> AsyncIterator[Location]:
+    def __aiter__(self) -> AsyncIterator[locations.Location]:
         """Iterate over the places, best first; the last one yielded counts as taken, or none if all were yielded."""
         return _PlaceIterator(self)
 
-    async def remembered(self) -> LocationDesignator:
+    async def remembered(self) -> locations.LocationDesignator:
         """Query the experience once, and return its places as an ordinary location designator."""
         source = self.experience if self.experience is not None else experience.get()
         if source is None:
@@ -90,8 +81,8 @@ class DatabaseCostmapLocation:
                 "past successes are queried from a memory, and none is open: resolve inside"
                 " `async with Memory.open(url)`, or pass one as `experience`"
             )
-        robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
-        height = objects.pose_of(self.target).position.z - base_height_m(robot)
+        robot = locations.resolve_robot(self.reachable_for) if self.reachable_for is not None else None
+        height = objects.pose_of(self.target).position.z - locations.base_height_m(robot)
         past = await source.successes(
             objects.designator_of(self.target).object_type, arm=self.reachable_arm, height=height
         )
@@ -103,12 +94,12 @@ class _PlaceIterator:
 
     def __init__(self, designator: DatabaseCostmapLocation) -> None:
         self._designator = designator
-        self._places: Iterator[Location] | None = None
+        self._places: Iterator[locations.Location] | None = None
 
     def __aiter__(self) -> _PlaceIterator:
         return self
 
-    async def __anext__(self) -> Location:
+    async def __anext__(self) -> locations.Location:
         if self._places is None:
             self._places = iter(await self._designator.remembered())
         for place in self._places:
@@ -117,7 +108,7 @@ class _PlaceIterator:
 
 
 @dataclass(frozen=True)
-class _ExperienceLocation(LocationDesignator):
+class _ExperienceLocation(locations.LocationDesignator):
     """The places of a `DatabaseCostmapLocation` after its experience has been queried."""
 
     target: objects.ObjectLike
@@ -128,12 +119,12 @@ class _ExperienceLocation(LocationDesignator):
     def _name(self) -> str:
         return DatabaseCostmapLocation.__name__
 
-    def _candidates(self) -> Iterator[Location | Refusal]:
+    def _candidates(self) -> Iterator[locations.Location | Refusal]:
         target_pose = objects.pose_of(self.target)
-        robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
+        robot = locations.resolve_robot(self.reachable_for) if self.reachable_for is not None else None
         origin = Pose((target_pose.position.x, target_pose.position.y, 0.0))
         ignored = robot.with_load() if robot is not None else None
-        clearance = base_clearance([robot] if robot is not None else [])
+        clearance = locations.base_clearance([robot] if robot is not None else [])
         free = queries.OccupancyCostmap(
             objects.require_world(),
             origin,
@@ -141,7 +132,7 @@ class _ExperienceLocation(LocationDesignator):
             size_cells=_POLICY_CELLS,
             ignore=ignored,
         )
-        height_m, lifting = base_height_m(robot), self._lifting(robot)
+        height_m, lifting = locations.base_height_m(robot), self._lifting(robot)
         for each in self.past:
             pose = target_pose @ each.stand
             base_pose = _upright_pose(pose, height_m)
@@ -160,7 +151,7 @@ class _ExperienceLocation(LocationDesignator):
             if refusal is not None:
                 yield Refusal(base_pose, refusal)
             else:
-                yield Location(base_pose, (each.arm,), each.grasp, each.torso_height)
+                yield locations.Location(base_pose, (each.arm,), each.grasp, each.torso_height)
 
     def _lifting(self, robot: objects.CurrentRobot | None) -> tuple[Arms, ...]:
         """Return the arms of past successes to repeat: where the arm is open, those that lift the target."""
@@ -181,20 +172,20 @@ def _upright_pose(base: Pose, height_m: float) -> Pose | None:
     return Pose((base.position.x, base.position.y, height_m), yaw_quaternion(base.yaw), base.frame)
 
 
-def _reach(robot: objects.CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> PlaceReach:
+def _reach(robot: objects.CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> locations.PlaceReach:
     """Return the arm if it reaches all three goals of the grasp from the base pose at the past torso height."""
     body, description = robot
     if past.arm not in description.arms:
-        return PlaceReach(refusal=f"the robot has no {past.arm.name} arm")
+        return locations.PlaceReach(refusal=f"the robot has no {past.arm.name} arm")
     if past.torso_height is not None:
         if description.torso_joint is None:
-            return PlaceReach(refusal="the robot has no torso to lift")
+            return locations.PlaceReach(refusal="the robot has no torso to lift")
         lower, upper = body.joint_limits(description.torso_joint)
         if not lower <= past.torso_height <= upper:
-            return PlaceReach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
+            return locations.PlaceReach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
         tool = robot.tool_pose(arm)
         return geometry.pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
-    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height, grasps=True)
+    return locations.reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height, grasps=True)

@@ -16,17 +16,7 @@ from pycrorm_async.errors import InternalError, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue import format as spool_format
 from pycrorm_async.queue.blobs import blob_bytes, blob_files
-from pycrorm_async.queue.locks import (
-    ALIVE,
-    BLOBS,
-    DRAIN,
-    MAKING,
-    MENDED,
-    PROGRESS,
-    TAIL,
-    FileLock,
-    is_locked,
-)
+from pycrorm_async.queue.locks import ALIVE, BLOBS, DRAIN, MAKING, MENDED, PROGRESS, TAIL, FileLock, is_locked
 from pycrorm_async.queue.scan import (
     SegmentScanner,
     Survey,

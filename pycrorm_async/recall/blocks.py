@@ -23,17 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id, row_key
-from pycrorm_async.recall.columns import (
-    RESERVED,
-    Case,
-    Column,
-    Mask,
-    Summary,
-    Words,
-    is_angle,
-    joined,
-    joined_words,
-)
+from pycrorm_async.recall.columns import RESERVED, Case, Column, Mask, Summary, Words, is_angle, joined, joined_words
 
 WORDS_MAX: Final = 16_384
 """Bounds the words of a feature in a memory.

@@ -26,12 +26,7 @@ from sqlalchemy import Select, select
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import (
-    DesignatorTypeDeclared,
-    ObjectAdded,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events.types import DesignatorTypeDeclared, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator

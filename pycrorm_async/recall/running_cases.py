@@ -19,15 +19,9 @@ from pycrorm_async import errors
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    Happening,
-)
+from pycrorm_async.events.types import EpisodeEnded, Happening
 from pycrorm_async.projections.fold import decode_events
-from pycrorm_async.recall.cases import (
-    READS,
-    EpisodeCases,
-)
+from pycrorm_async.recall.cases import READS, EpisodeCases
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.record.episode_writer import Emitter
 from pycrorm_async.record.event_feed import EventBuffer

@@ -33,12 +33,7 @@ from pycrorm_async.record.event_times import At, EventTimes
 from pycrorm_async.record.objects import RecordedObjects
 from pycrorm_async.record.opening import EpisodeOpening, Failures, end_statuses
 from pycrorm_async.record.recorded_before import RecordedBefore, StoredEpisode, StoredEpisodes
-from pycrorm_async.record.values import (
-    PoseLike,
-    clean_repr,
-    encode_or_missing,
-    message_of,
-)
+from pycrorm_async.record.values import PoseLike, clean_repr, encode_or_missing, message_of
 
 if TYPE_CHECKING:
     from pycrorm_async.record.samples import SampleBlocks

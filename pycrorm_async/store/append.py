@@ -38,15 +38,7 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId
 from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialect import DECLARATIONS, Dialect, Insertion, RowRefused
-from pycrorm_async.store.stored import (
-    BLOCK_EVENTS,
-    DigestRow,
-    EpisodeRow,
-    RunningDigest,
-    Span,
-    Stored,
-    StoredEvent,
-)
+from pycrorm_async.store.stored import BLOCK_EVENTS, DigestRow, EpisodeRow, RunningDigest, Span, Stored, StoredEvent
 
 # === append rules =============================================================================================
 #

@@ -32,26 +32,11 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store import schema
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
-from pycrorm_async.store.append import (
-    EVENTS_MANY,
-    Appending,
-    Blobs,
-    RunningDigests,
-    events_warning,
-    number_warning,
-)
+from pycrorm_async.store.append import EVENTS_MANY, Appending, Blobs, RunningDigests, events_warning, number_warning
 from pycrorm_async.store.dialect import LogIdentity, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
-from pycrorm_async.store.stored import (
-    DigestRow,
-    EpisodeRow,
-    Incarnation,
-    Span,
-    Stored,
-    StoredEvent,
-    consecutive,
-)
+from pycrorm_async.store.stored import DigestRow, EpisodeRow, Incarnation, Span, Stored, StoredEvent, consecutive
 
 _log = logging.getLogger("pycrorm_async")
 _MANY_EVENTS = 1_000

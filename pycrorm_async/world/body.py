@@ -18,22 +18,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, Solid, box_around, rotation_matrix, solids_of
 from pycrorm_async.world.engines import Color, Engine
-from pycrorm_async.world.pose import (
-    IDENTITY,
-    DescriptionNotLoadable,
-    JointLimitExceeded,
-    JointType,
-    Pose,
-    PoseRefused,
-    UnknownJoint,
-    UnknownLink,
-    Vector,
-)
 from pycrorm_async.world.urdf_model import Joint, Model, along
 
-_AT_ORIGIN: Frame = (Vector(0.0, 0.0, 0.0), IDENTITY)
+_AT_ORIGIN: Frame = (poses.Vector(0.0, 0.0, 0.0), poses.IDENTITY)
 
 
 class Body:
@@ -51,19 +41,19 @@ class Body:
     """
 
     def __init__(
-        self, name: str, model: Model, engine: Engine, pose: Pose | None, color: Color | None, base: str = ""
+        self, name: str, model: Model, engine: Engine, pose: poses.Pose | None, color: Color | None, base: str = ""
     ) -> None:
         self._engine = engine
         self.base = base or model.root
         """The link whose frame is the body's pose."""
         if self.base not in model.paths:
-            raise UnknownLink(name, self.base, tuple(model.paths))
+            raise poses.UnknownLink(name, self.base, tuple(model.paths))
         self.solids: dict[str, tuple[Solid, ...]] = {}
         for link, each in model.links.items():
             try:
                 self.solids[link] = solids_of(each.collisions)
             except ValueError as fault:
-                raise DescriptionNotLoadable(name, f"collision of link {link!r}: {fault}") from fault
+                raise poses.DescriptionNotLoadable(name, f"collision of link {link!r}: {fault}") from fault
         self.number, self.remarks = engine.load(name, model)
         self._model = model
         joints = tuple(_joints_below(model, model.root))
@@ -71,21 +61,23 @@ class Body:
         """The names of all links, the root first, each before the links below it."""
         self.joint_types = {each.name: each.kind for each in joints}
         self.limits: dict[str, tuple[float, float]] = {
-            joint: model.joints[joint].bounds for joint, kind in self.joint_types.items() if kind is not JointType.FIXED
+            joint: model.joints[joint].bounds
+            for joint, kind in self.joint_types.items()
+            if kind is not poses.JointType.FIXED
         }
         self.movable_above = {
-            link: tuple(each.name for each in reversed(model.paths[link]) if each.kind is not JointType.FIXED)
+            link: tuple(each.name for each in reversed(model.paths[link]) if each.kind is not poses.JointType.FIXED)
             for link in self.links
         }
         self._followers: dict[str, list[Joint]] = {}
         for joint in model.joints.values():
-            if joint.mimic is not None and joint.kind is not JointType.FIXED:
+            if joint.mimic is not None and joint.kind is not poses.JointType.FIXED:
                 self._followers.setdefault(joint.mimic.joint, []).append(joint)
         nearest = {joint: min(max(0.0, lower), upper) for joint, (lower, upper) in self.limits.items()}
         self.start = {joint: model.joints[joint].position(nearest) for joint in nearest}
         self.positions = dict(self.start)
         self._to_base = model.paths[self.base]
-        self.pose = self.root_pose = Pose()
+        self.pose = self.root_pose = poses.Pose()
         if color is not None:
             engine.paint(self.number, color)
         if moved := {joint: position for joint, position in self.start.items() if position}:
@@ -108,13 +100,13 @@ class Body:
         following = [each for joint in free for each in self._followers.get(joint, ())]
         return {**free, **{each.name: each.position(free) for each in following}}
 
-    def place(self, pose: Pose) -> None:
+    def place(self, pose: poses.Pose) -> None:
         """Move the base link's frame to this pose."""
         root = self.root_at(pose)
         self._engine.place(self.number, root)
         self.pose, self.root_pose = pose, root
 
-    def root_at(self, pose: Pose) -> Pose:
+    def root_at(self, pose: poses.Pose) -> poses.Pose:
         """Return the pose that the root link's frame has when the base link's frame is at this pose."""
         return pose @ along(self._to_base, self.positions).inverse() if self._to_base else pose
 
@@ -204,7 +196,7 @@ def inner_points(body: Body) -> list[list[float]]:
 class ObjectState:
     """The state of one object: pose, joint positions (rad or m), and parent's name and link if it was attached."""
 
-    pose: Pose
+    pose: poses.Pose
     joints: Mapping[str, float]
     attached_to: tuple[str, str | None] | None
 
@@ -226,12 +218,12 @@ class StateChange(NamedTuple):
 def check_state(name: str, body: Body, state: ObjectState) -> None:
     """Raise `UnknownJoint`, `PoseRefused` or `JointLimitExceeded` if the body of that object cannot take this state."""
     if not all(map(math.isfinite, (*state.pose.position, *state.pose.orientation))):
-        raise PoseRefused(name, state.pose, "its numbers must be finite")
+        raise poses.PoseRefused(name, state.pose, "its numbers must be finite")
     for joint, position in state.joints.items():
         if joint not in body.limits:
-            raise UnknownJoint(name, joint, tuple(body.positions))
+            raise poses.UnknownJoint(name, joint, tuple(body.positions))
         if not math.isfinite(position):
-            raise JointLimitExceeded(name, joint, position, body.limits[joint])
+            raise poses.JointLimitExceeded(name, joint, position, body.limits[joint])
 
 
 def set_state(body: Body, state: ObjectState) -> StateChange:

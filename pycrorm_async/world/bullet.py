@@ -25,30 +25,12 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 
 from pycrorm_async import connected_var
 from pycrorm_async.connected_var import ConnectedVar
+from pycrorm_async.world import pose as poses
 from pycrorm_async.world.body import Body, ObjectState, WorldState, check_state, inner_points, set_state
 from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.engines import Color, Engine, engine_class
 from pycrorm_async.world.model_boxes import shape_boxes
 from pycrorm_async.world.models import built_in_urdf
-from pycrorm_async.world.pose import (
-    COORDINATE_MAX,
-    Arms,
-    AttachmentRefused,
-    DuplicateName,
-    JointFollows,
-    JointLimitExceeded,
-    JointType,
-    NoWorld,
-    ObjectNotInWorld,
-    ObjectRefused,
-    ObjectType,
-    Pose,
-    PoseRefused,
-    UnknownJoint,
-    UnknownLink,
-    WorldClosed,
-    WorldMode,
-)
 from pycrorm_async.world.urdf import RobotDescription, robot_description
 from pycrorm_async.world.urdf_model import Model, read_model, urdf_text
 
@@ -80,7 +62,7 @@ class BulletWorld:
 
     def __init__(
         self,
-        mode: WorldMode = WorldMode.DIRECT,
+        mode: poses.WorldMode = poses.WorldMode.DIRECT,
         *,
         engine: str | type[Engine] | None = None,
         copy_of: BulletWorld | None = None,
@@ -130,7 +112,7 @@ class BulletWorld:
 
     def _begin(self) -> None:
         if self._engine is not None or self._left:
-            raise WorldClosed("a world can be entered only once; create a new BulletWorld()")
+            raise poses.WorldClosed("a world can be entered only once; create a new BulletWorld()")
         chosen = engine_class(self._engine_asked)
         self._engine, self.engine_title = chosen(self.mode), chosen.title()
 
@@ -177,7 +159,7 @@ class BulletWorld:
     def engine(self) -> Engine:
         """The engine, for this package only: moving its bodies notifies no observer. Raises `WorldClosed`."""
         if self._engine is None:
-            raise WorldClosed(
+            raise poses.WorldClosed(
                 "the world is closed; only its last poses and joint positions can be read"
                 if self._left
                 else "the world is not entered; act inside `with BulletWorld() as world:`"
@@ -214,7 +196,7 @@ class BulletWorld:
         for obj in self._objects.values():
             if obj.name == name:
                 return obj
-        raise ObjectNotInWorld(name, tuple(obj.name for obj in self.objects))
+        raise poses.ObjectNotInWorld(name, tuple(obj.name for obj in self.objects))
 
     def has(self, obj: Object) -> bool:
         """Return whether the world contains this object; objects are compared by identity."""
@@ -223,7 +205,7 @@ class BulletWorld:
     def add(self, obj: Object) -> None:
         """Add an object whose body is loaded, and notify the observers; only `Object` calls this."""
         self._objects[obj.body.number] = obj
-        if self._robot is None and obj.object_type is ObjectType.ROBOT:
+        if self._robot is None and obj.object_type is poses.ObjectType.ROBOT:
             self._robot = obj
         for observer in self._observers:
             observer.object_added(obj)
@@ -235,7 +217,7 @@ class BulletWorld:
         obj.body.unload()
         del self._objects[obj.body.number]
         if obj is self._robot:
-            robots = (other for other in self._objects.values() if other.object_type is ObjectType.ROBOT)
+            robots = (other for other in self._objects.values() if other.object_type is poses.ObjectType.ROBOT)
             self._robot = next(robots, None)
         for observer in self._observers:
             observer.object_removed(obj)
@@ -373,7 +355,7 @@ class Attachment:
     parent: Object
     child: Object
     link: str | None
-    relative: Pose
+    relative: poses.Pose
 
 
 class Attachments:
@@ -401,16 +383,16 @@ class Attachments:
     def add(self, parent: Object, child: Object, link: str | None) -> None:
         """Attach `child` at its current pose. Raises `AttachmentRefused`."""
         if parent.world is not child.world:
-            raise AttachmentRefused(f"{child.name!r} and {parent.name!r} are in different worlds")
+            raise poses.AttachmentRefused(f"{child.name!r} and {parent.name!r} are in different worlds")
         present = self._of_child.get(child)
         if present is not None:
-            raise AttachmentRefused(
+            raise poses.AttachmentRefused(
                 f"{child.name!r} is attached to {present.parent.name!r} already; detach it there first"
             )
         above: Object | None = parent
         while above is not None:
             if above is child:
-                raise AttachmentRefused(f"{child.name!r} cannot be attached to itself (through {parent.name!r})")
+                raise poses.AttachmentRefused(f"{child.name!r} cannot be attached to itself (through {parent.name!r})")
             above = attachment.parent if (attachment := self._of_child.get(above)) else None
         self.put(parent, child, link)
 
@@ -427,7 +409,7 @@ class Attachments:
         """Remove an attachment and return it. Raises `AttachmentRefused` if `child` is not attached to `parent`."""
         present = self._of_child.get(child)
         if present is None or present.parent is not parent:
-            raise AttachmentRefused(f"{child.name!r} is not attached to {parent.name!r}")
+            raise poses.AttachmentRefused(f"{child.name!r} is not attached to {parent.name!r}")
         return self._of_child.pop(child)
 
     def carry(self, parent: Object, joints: Iterable[str] | None = None) -> list[Object]:
@@ -477,15 +459,15 @@ class Object:
     """
 
     name: str
-    object_type: ObjectType
+    object_type: poses.ObjectType
     world: BulletWorld
-    original_pose: Pose
+    original_pose: poses.Pose
     description_text: str
     model: Model
     """What was understood of the description."""
     color: Color | None
     robot_description: RobotDescription | None
-    chains: dict[Arms, Chain]
+    chains: dict[poses.Arms, Chain]
     """The chains of a robot's arms that were needed so far, for `kinematics`."""
     body: Body
     """The body in the engine, for this package only: moving it notifies no observer."""
@@ -496,9 +478,9 @@ class Object:
     def __init__(
         self,
         name: str,
-        object_type: ObjectType,
+        object_type: poses.ObjectType,
         description: str | Path | None = None,
-        pose: Pose | None = None,
+        pose: poses.Pose | None = None,
         *,
         world: BulletWorld | None = None,
         color: Color | None = None,
@@ -511,19 +493,21 @@ class Object:
         _check_mass(name, mass_kg)
         world = world if world is not None else current_world.get()
         if world is None:
-            raise NoWorld(f"object {name!r}")
+            raise poses.NoWorld(f"object {name!r}")
         engine = world.engine
         if any(present.name == name for present in world.objects):
-            raise DuplicateName(name)
+            raise poses.DuplicateName(name)
         self.name = name
         self.object_type = object_type
         self.world = world
         self.copy_of = None
         if pose is not None:
             _check_pose(name, pose)
-        is_robot = object_type is ObjectType.ROBOT
+        is_robot = object_type is poses.ObjectType.ROBOT
         if base_link and not is_robot:
-            raise ObjectRefused(f"only a robot has a base link other than its root, but {name!r} is {object_type.name}")
+            raise poses.ObjectRefused(
+                f"only a robot has a base link other than its root, but {name!r} is {object_type.name}"
+            )
         if robot is None and is_robot:
             robot = robot_description(name)
         if base_link is None and is_robot and robot is not None:
@@ -565,11 +549,11 @@ class Object:
     # --- pose and extent --------------------------------------------------------------------------------------
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> poses.Pose:
         """The pose that was set last, or to which the object was carried, unrounded. Readable after removal."""
         return self.body.pose
 
-    def set_pose(self, pose: Pose) -> None:
+    def set_pose(self, pose: poses.Pose) -> None:
         """Move the base link's frame to this pose, together with the objects attached to this one.
 
         An object that is attached to a parent stays attached, at its new pose relative to the parent.
@@ -587,11 +571,11 @@ class Object:
         """The link whose frame is a robot's pose; empty for the root link."""
         return "" if self.body.base == self.body.root else self.body.base
 
-    def root_pose(self, pose: Pose | None = None) -> Pose:
+    def root_pose(self, pose: poses.Pose | None = None) -> poses.Pose:
         """Return the pose of the root link's frame, now or with the object at `pose` and its joints as they are."""
         return self.body.root_pose if pose is None else self.body.root_at(pose)
 
-    def link_pose(self, link: str | None = None) -> Pose:
+    def link_pose(self, link: str | None = None) -> poses.Pose:
         """Return the pose of a link's frame in "map"; None means the base link. Raises `UnknownLink`."""
         if link is None or link == self.body.base:
             return self.body.pose
@@ -600,9 +584,9 @@ class Object:
         self._check_link(link)
         self.check_present()
         position, orientation = self.body.link_frame(link)
-        return Pose(position, orientation)
+        return poses.Pose(position, orientation)
 
-    def link_pose_at(self, link: str, positions: Mapping[str, float]) -> Pose:
+    def link_pose_at(self, link: str, positions: Mapping[str, float]) -> poses.Pose:
         """Return the pose that a link's frame would have in "map" at these joint positions (rad or m).
 
         Nothing is moved and limits are not checked. Raises `UnknownLink`, `UnknownJoint`.
@@ -612,7 +596,7 @@ class Object:
             self.joint_position(joint)
         self.check_present()
         position, orientation = self.body.link_frame_at(link, positions)
-        return Pose(position, orientation)
+        return poses.Pose(position, orientation)
 
     def bounding_box(self, link: str | None = None) -> BoundingBox:
         """Return the box along the axes of "map" around the whole object or one link, without margin.
@@ -642,7 +626,7 @@ class Object:
         The description counts for objects that grippers lift, not for robots and environments, whose models often have
         guessed masses.
         """
-        if self._mass_kg is not None or self.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
+        if self._mass_kg is not None or self.object_type in (poses.ObjectType.ROBOT, poses.ObjectType.ENVIRONMENT):
             return self._mass_kg
         return self.model.mass_kg
 
@@ -668,7 +652,7 @@ class Object:
         try:
             return self.body.positions[joint]
         except KeyError:
-            raise UnknownJoint(self.name, joint, self.joints) from None
+            raise poses.UnknownJoint(self.name, joint, self.joints) from None
 
     def joint_positions(self) -> dict[str, float]:
         """Return the positions of all movable joints by name, rad or m; a copy."""
@@ -679,14 +663,14 @@ class Object:
         try:
             return self.body.limits[joint]
         except KeyError:
-            raise UnknownJoint(self.name, joint, self.joints) from None
+            raise poses.UnknownJoint(self.name, joint, self.joints) from None
 
-    def joint_type(self, joint: str) -> JointType:
+    def joint_type(self, joint: str) -> poses.JointType:
         """Return the type of a joint, also of a fixed one. Raises `UnknownJoint`."""
         try:
             return self.body.joint_types[joint]
         except KeyError:
-            raise UnknownJoint(self.name, joint, self.joints) from None
+            raise poses.UnknownJoint(self.name, joint, self.joints) from None
 
     def joints_above(self, link: str | None) -> tuple[str, ...]:
         """Return the movable joints between a link (None: the base link) and the root, nearest first.
@@ -719,10 +703,10 @@ class Object:
             if position == self.body.positions[joint] or (leader in targets and math.isfinite(position)):
                 continue
             if leader is not None:
-                raise JointFollows(self.name, joint, leader)
+                raise poses.JointFollows(self.name, joint, leader)
             within = lower - _PAST_LIMIT_MAX <= position <= upper + _PAST_LIMIT_MAX
-            if not (within and abs(position) <= COORDINATE_MAX):
-                raise JointLimitExceeded(self.name, joint, position, (lower, upper))
+            if not (within and abs(position) <= poses.COORDINATE_MAX):
+                raise poses.JointLimitExceeded(self.name, joint, position, (lower, upper))
         targets = self.body.followed(targets)
         if targets:
             before = self.body.pose
@@ -756,7 +740,7 @@ class Object:
         """
         self.check_present()
         if not isinstance(child, Object):
-            raise AttachmentRefused(f"only an Object can be attached to {self.name!r}, got {child!r}")
+            raise poses.AttachmentRefused(f"only an Object can be attached to {self.name!r}, got {child!r}")
         child.check_present()
         if link is not None:
             self._check_link(link)
@@ -806,7 +790,7 @@ class Object:
         """Raise `WorldClosed` if the world is closed, `ObjectNotInWorld` if the object was removed."""
         _ = self.world.engine
         if not self.world.has(self):
-            raise ObjectNotInWorld(self.name, tuple(present.name for present in self.world.objects))
+            raise poses.ObjectNotInWorld(self.name, tuple(present.name for present in self.world.objects))
 
     def _keep_attached(self) -> None:
         """Keep the attachment to the parent at the object's new pose."""
@@ -816,32 +800,32 @@ class Object:
 
     def _check_link(self, link: str) -> str:
         if link not in self.body.movable_above:
-            raise UnknownLink(self.name, link, self.links)
+            raise poses.UnknownLink(self.name, link, self.links)
         return link
 
 
 def _check_identity(name: object, object_type: object) -> None:
     """Raise `ObjectRefused` unless both have the right type; every record of an object holds them."""
     if not isinstance(name, str):
-        raise ObjectRefused(f"an object's name must be a str, got {name!r}")
-    if not isinstance(object_type, ObjectType):
-        raise ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
+        raise poses.ObjectRefused(f"an object's name must be a str, got {name!r}")
+    if not isinstance(object_type, poses.ObjectType):
+        raise poses.ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
 
 
 def _check_mass(name: str, mass_kg: object) -> None:
     """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
     if mass_kg is not None and not (isinstance(mass_kg, int | float) and 0 < mass_kg < math.inf):
-        raise ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r}")
+        raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r}")
 
 
-def _check_pose(name: str, pose: Pose) -> Pose:
+def _check_pose(name: str, pose: poses.Pose) -> poses.Pose:
     """Return the pose. Raises `PoseRefused` if the object cannot be moved to it."""
-    if not isinstance(pose, Pose):
-        raise PoseRefused(name, pose, "it is not a Pose")
+    if not isinstance(pose, poses.Pose):
+        raise poses.PoseRefused(name, pose, "it is not a Pose")
     if pose.frame != "map":
-        raise PoseRefused(name, pose, f"its frame is {pose.frame!r}: transform it to 'map' first")
-    if not all(abs(value) <= COORDINATE_MAX for value in (*pose.position, *pose.orientation)):
-        raise PoseRefused(name, pose, f"its numbers must be finite and at most {COORDINATE_MAX:g}")
+        raise poses.PoseRefused(name, pose, f"its frame is {pose.frame!r}: transform it to 'map' first")
+    if not all(abs(value) <= poses.COORDINATE_MAX for value in (*pose.position, *pose.orientation)):
+        raise poses.PoseRefused(name, pose, f"its numbers must be finite and at most {poses.COORDINATE_MAX:g}")
     return pose
 
 

@@ -297,8 +297,12 @@ class EngineMissing(WorldUnavailable, MissingExtra):
 
 _ENGINE_TITLES = {"bullet": "Bullet", "mujoco": "MuJoCo"}
 
-BulletMissing = EngineMissing
-"""The former name."""
+
+class BulletMissing(EngineMissing):
+    """Bullet is not installed, and a world in Bullet was asked for."""
+
+    def __init__(self) -> None:
+        super().__init__("bullet")
 
 
 class WorldClosed(WorldError):

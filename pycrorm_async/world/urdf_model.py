@@ -28,16 +28,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 from xml.sax.saxutils import quoteattr
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.world.pose import (
-    COORDINATE_MAX,
-    DescriptionNotLoadable,
-    JointType,
-    Pose,
-    Quaternion,
-    Vector,
-    product,
-    rotated,
-)
+from pycrorm_async.world import pose as poses
 
 Triple = tuple[float, float, float]
 
@@ -68,13 +59,13 @@ class Joint(NamedTuple):
     """One joint; `kind` is FIXED if it cannot move."""
 
     name: str
-    kind: JointType
+    kind: poses.JointType
     parent: str
     child: str
-    origin: Pose
+    origin: poses.Pose
     rpy: Triple
     """The rotation of `origin` as the model has it, which no conversion rounds."""
-    axis: Vector
+    axis: poses.Vector
     """Of length one, in the child's frame."""
     bounds: Bounds
     mimic: Mimic | None = None
@@ -83,7 +74,7 @@ class Joint(NamedTuple):
 
     def position(self, positions: Mapping[str, float]) -> float:
         """Return the joint's position; joints that are left out are at 0, and followers where their leader is."""
-        if self.kind is JointType.FIXED:
+        if self.kind is poses.JointType.FIXED:
             return 0.0
         if self.mimic is not None and (self.mimic.joint in positions or self.name not in positions):
             return positions.get(self.mimic.joint, 0.0) * self.mimic.multiplier + self.mimic.offset
@@ -92,7 +83,7 @@ class Joint(NamedTuple):
     @property
     def moves_freely(self) -> bool:
         """Whether the joint moves and follows no other."""
-        return self.kind is not JointType.FIXED and self.mimic is None
+        return self.kind is not poses.JointType.FIXED and self.mimic is None
 
 
 class Shape(NamedTuple):
@@ -177,33 +168,35 @@ class Model:
         return mass if 0 < mass < math.inf else None
 
 
-def along(joints: Sequence[Joint], positions: Mapping[str, float]) -> Pose:
+def along(joints: Sequence[Joint], positions: Mapping[str, float]) -> poses.Pose:
     """Return the frame of the last joint's child link in the first joint's parent link, at these positions."""
     x = y = z = 0.0
-    turn = Quaternion(0.0, 0.0, 0.0, 1.0)
+    turn = poses.Quaternion(0.0, 0.0, 0.0, 1.0)
     for each in joints:
-        step = rotated(turn, each.origin.position)
-        x, y, z, turn = x + step.x, y + step.y, z + step.z, product(turn, each.origin.orientation)
+        step = poses.rotated(turn, each.origin.position)
+        x, y, z, turn = x + step.x, y + step.y, z + step.z, poses.product(turn, each.origin.orientation)
         position = each.position(positions)
-        if each.kind is JointType.PRISMATIC:
-            step = rotated(turn, [position * along for along in each.axis])
+        if each.kind is poses.JointType.PRISMATIC:
+            step = poses.rotated(turn, [position * along for along in each.axis])
             x, y, z = x + step.x, y + step.y, z + step.z
         elif position:
-            turn = product(turn, about(each.axis, position))
-    return Pose((x, y, z), turn)
+            turn = poses.product(turn, about(each.axis, position))
+    return poses.Pose((x, y, z), turn)
 
 
-def about(axis: Sequence[float], angle: float) -> Quaternion:
+def about(axis: Sequence[float], angle: float) -> poses.Quaternion:
     """Return the rotation by an angle, rad, about an axis of length one."""
     x, y, z = axis
     sine = math.sin(angle / 2)
-    return Quaternion(x * sine, y * sine, z * sine, math.cos(angle / 2))
+    return poses.Quaternion(x * sine, y * sine, z * sine, math.cos(angle / 2))
 
 
-def origin(xyz: Sequence[float], rpy: Sequence[float]) -> Pose:
+def origin(xyz: Sequence[float], rpy: Sequence[float]) -> poses.Pose:
     """Return the pose at a position, turned by roll, pitch and yaw as in URDF."""
     roll, pitch, yaw = rpy
-    return Pose(xyz, product(product(about((0, 0, 1), yaw), about((0, 1, 0), pitch)), about((1, 0, 0), roll)))
+    return poses.Pose(
+        xyz, poses.product(poses.product(about((0, 0, 1), yaw), about((0, 1, 0), pitch)), about((1, 0, 0), roll))
+    )
 
 
 # === files ====================================================================================================
@@ -236,7 +229,7 @@ def urdf_text(name: str, description: str | Path, packages: Mapping[str, str | P
         else:
             text, folder = _decoded(path.read_bytes()), path.resolve().parent
     except (OSError, ValueError) as reason:
-        raise DescriptionNotLoadable(name, f"{path} cannot be read: {reason}") from reason
+        raise poses.DescriptionNotLoadable(name, f"{path} cannot be read: {reason}") from reason
     try:
         robot, is_repaired = _parsed(text)
         _check_tree(robot)
@@ -255,7 +248,7 @@ def urdf_text(name: str, description: str | Path, packages: Mapping[str, str | P
         for each in (*unlimited, *missing):
             raise each
     except (ParseError, UrdfFault) as fault:
-        raise DescriptionNotLoadable(name, f"{place}{fault}") from fault
+        raise poses.DescriptionNotLoadable(name, f"{place}{fault}") from fault
     return text
 
 
@@ -425,12 +418,12 @@ def _joined_link(joint: Element, end: str) -> str:
 # === reading ==================================================================================================
 
 _KINDS = {
-    "revolute": JointType.REVOLUTE,
-    "continuous": JointType.CONTINUOUS,
-    "prismatic": JointType.PRISMATIC,
-    "fixed": JointType.FIXED,
-    "floating": JointType.FIXED,
-    "planar": JointType.FIXED,
+    "revolute": poses.JointType.REVOLUTE,
+    "continuous": poses.JointType.CONTINUOUS,
+    "prismatic": poses.JointType.PRISMATIC,
+    "fixed": poses.JointType.FIXED,
+    "floating": poses.JointType.FIXED,
+    "planar": poses.JointType.FIXED,
 }
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(inf|infinity|nan)", re.IGNORECASE | re.ASCII)
 _SIZES = {
@@ -528,7 +521,7 @@ def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint
     axis, limit, mimic, safety = (element.find(tag) for tag in ("axis", "limit", "mimic", "safety_controller"))
     direction = (1.0, 0.0, 0.0) if axis is None else _numbers(axis, "xyz", 3, owner, (1.0, 0.0, 0.0))
     length = math.hypot(*direction)
-    if not 0 < length < math.inf and kind is not JointType.FIXED:
+    if not 0 < length < math.inf and kind is not poses.JointType.FIXED:
         raise UrdfFault(f'{owner}: <axis xyz="{" ".join(map(str, direction))}"> has no direction')
     x, y, z = (each / (length or 1.0) for each in direction)
     for each in element:
@@ -543,7 +536,7 @@ def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint
     if safety is not None:
         soft = Bounds(_number(safety, "soft_lower_limit", owner, 0.0), _number(safety, "soft_upper_limit", owner, 0.0))
     bounds = ENDLESS if limit is None else Bounds(*(_number(limit, each, owner, 0.0) for each in ("lower", "upper")))
-    if kind in (JointType.CONTINUOUS, JointType.FIXED):
+    if kind in (poses.JointType.CONTINUOUS, poses.JointType.FIXED):
         bounds = ENDLESS
     elif limit is None and mimic is None:
         unlimited.append(name)
@@ -557,7 +550,7 @@ def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint
         _joined_link(element, "child"),
         origin(xyz, rpy),
         rpy,
-        Vector(x, y, z),
+        poses.Vector(x, y, z),
         bounds,
         follows,
         soft if soft is not None and soft.lower < soft.upper else None,
@@ -583,7 +576,7 @@ def _following(joint: Joint, joints: Mapping[str, Joint]) -> Joint:
             break
         leader, multiplier, offset = above.joint, multiplier * above.multiplier, multiplier * above.offset + offset
     bounds = joint.bounds
-    if bounds == ENDLESS and joint.kind is not JointType.CONTINUOUS and multiplier:
+    if bounds == ENDLESS and joint.kind is not poses.JointType.CONTINUOUS and multiplier:
         lower, upper = sorted(multiplier * each + offset for each in joints[leader].bounds)
         bounds = Bounds(lower, upper)
     return joint._replace(mimic=Mimic(leader, multiplier, offset), bounds=bounds)
@@ -600,9 +593,9 @@ def _origin(element: Element, owner: str) -> tuple[Triple, Triple]:
         return _ZERO, _ZERO
     xyz, rpy = _numbers(each, "xyz", 3, owner, _ZERO), _numbers(each, "rpy", 3, owner, _ZERO)
     for value in (*xyz, *rpy):
-        if not abs(value) <= COORDINATE_MAX:
+        if not abs(value) <= poses.COORDINATE_MAX:
             raise UrdfFault(
-                f"{owner}: <origin> holds {value:g}; numbers must be finite, and none above {COORDINATE_MAX:g}"
+                f"{owner}: <origin> holds {value:g}; numbers must be finite, and none above {poses.COORDINATE_MAX:g}"
             )
     return xyz, rpy  # type: ignore[return-value]  # three numbers each
 

@@ -15,12 +15,7 @@ import pandas as pd
 import pytest
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra, NotEnoughExperience
-from pycrorm_async.learning.policy import (
-    Evidence,
-    PickUpChoice,
-    Policy,
-    default_policy,
-)
+from pycrorm_async.learning.policy import Evidence, PickUpChoice, Policy, default_policy
 from pycrorm_async.learning.tree import learn
 from pycrorm_async.world.pose import Arms, Grasp
 from tests.learning.geometric_rollouts import frame_of, succeeds

@@ -15,13 +15,7 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, UserView, recover
-from pycrorm_async.errors import (
-    CallerError,
-    DatabaseForeign,
-    DatabaseUnavailable,
-    EpisodeParked,
-    FlushTimeout,
-)
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, EpisodeParked, FlushTimeout
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.sources import LiveSource

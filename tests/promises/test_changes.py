@@ -17,7 +17,7 @@ from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseForeign
-from pycrorm_async.events.codec import Decoder, Upcaster
+from pycrorm_async.events.codec import UPCASTERS, Decoder, Upcaster
 from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
@@ -319,7 +319,7 @@ def weighed(old: dict[str, Any]) -> dict[str, Any]:
     return old | {"name": old["name"].upper(), "mass_kg": 1.0}
 
 
-STEPS: dict[tuple[str, int], Upcaster] = {("ObjectAdded", 1): weighed}
+STEPS: dict[tuple[str, int], Upcaster] = {**UPCASTERS, ("ObjectAdded", 1): weighed}
 
 
 async def test_an_upcaster_serves_fold_rebuild_and_snapshots_of_older_events(

@@ -12,13 +12,7 @@ from pycrorm_async.events.types import FieldDeclared, FieldType, MissingValue, O
 from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
 from pycrorm_async.plan.language import Outcome
 from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
-from pycrorm_async.record.values import (
-    UnrecordableValue,
-    clean_repr,
-    encode_or_missing,
-    encoder_of,
-    failure_value,
-)
+from pycrorm_async.record.values import UnrecordableValue, clean_repr, encode_or_missing, encoder_of, failure_value
 from pycrorm_async.world.pose import Arms, ObjectType, Pose
 
 

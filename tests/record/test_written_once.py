@@ -24,11 +24,7 @@ from pycrorm_async.events.types import (
     with_poses,
 )
 from pycrorm_async.plan import PlanFailure
-from pycrorm_async.plan.actions import (
-    MoveTorsoActionPerformable,
-    NavigateActionPerformable,
-    PickUpActionPerformable,
-)
+from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable, PickUpActionPerformable
 from pycrorm_async.plan.motions import simulated_robot
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.projections.columns import COLUMNS

@@ -26,20 +26,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, box_of, rotation_matrix
 from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part
 from pycrorm_async.world.meshes import is_read_by_bullet, mesh_points, points_as_stl
-from pycrorm_async.world.pose import (
-    COORDINATE_MAX,
-    DescriptionNotLoadable,
-    EngineMissing,
-    JointType,
-    Pose,
-    Quaternion,
-    Vector,
-    WorldMode,
-    WorldUnavailable,
-)
 from pycrorm_async.world.urdf_model import Model, Shape, along
 
 _ROOT = -1  # Bullet's number of a body's first link
@@ -65,7 +55,7 @@ class _Body:
             info = bullet.getJointInfo(number, joint, physicsClientId=client)
             self.joints[info[1].decode()] = self.links[info[12].decode()] = joint
         self.by_chain = len(self.joints) > _STATES_MAX
-        self.root = Pose()
+        self.root = poses.Pose()
         self.positions: dict[str, float] = {}
         """Kept only if frames are computed by the chain of joints."""
         self.placed_boxes: tuple[Floats, Floats] | None = None
@@ -92,7 +82,7 @@ class _Ball(NamedTuple):
     part: int
     body: int
     link: int
-    middle: Vector
+    middle: poses.Vector
     radius: float
 
 
@@ -103,7 +93,7 @@ class Bullet:
         client: Bullet's number of it.
     """
 
-    def __init__(self, mode: WorldMode) -> None:
+    def __init__(self, mode: poses.WorldMode) -> None:
         self.client = _connect(mode)
         self._bullet = library()
         self._bodies: dict[int, _Body] = {}
@@ -136,7 +126,7 @@ class Bullet:
         """Return Bullet's number of a link."""
         return self._bodies[number].links[link]
 
-    def place(self, number: int, root: Pose) -> None:
+    def place(self, number: int, root: poses.Pose) -> None:
         """Move the root link's frame to this pose."""
         self._bullet.resetBasePositionAndOrientation(
             number, root.position, root.orientation, physicsClientId=self.client
@@ -302,20 +292,20 @@ class Bullet:
 
 def _frame(state: Sequence[Any]) -> Frame:
     """Return the frame of a link's centre of mass, which is in the link's own frame, but in double precision."""
-    return Vector(*state[0]), Quaternion(*state[1])
+    return poses.Vector(*state[0]), poses.Quaternion(*state[1])
 
 
-def _connect(mode: WorldMode) -> int:
+def _connect(mode: poses.WorldMode) -> int:
     """Open a Bullet client with a floor, its first body."""
     bullet = library()
-    if mode is WorldMode.GUI and not os.environ.get("DISPLAY"):  # without a display Bullet ends the process
-        raise WorldUnavailable("a window needs a display, but DISPLAY is not set; use WorldMode.DIRECT")
+    if mode is poses.WorldMode.GUI and not os.environ.get("DISPLAY"):  # without a display Bullet ends the process
+        raise poses.WorldUnavailable("a window needs a display, but DISPLAY is not set; use WorldMode.DIRECT")
     try:
-        client: int = bullet.connect(bullet.GUI if mode is WorldMode.GUI else bullet.DIRECT)
+        client: int = bullet.connect(bullet.GUI if mode is poses.WorldMode.GUI else bullet.DIRECT)
     except bullet.error as reason:
-        raise WorldUnavailable(f"Bullet cannot open another world: {reason}") from reason
+        raise poses.WorldUnavailable(f"Bullet cannot open another world: {reason}") from reason
     if client < 0:
-        raise WorldUnavailable("Bullet cannot open another world; close worlds that are not needed")
+        raise poses.WorldUnavailable("Bullet cannot open another world; close worlds that are not needed")
     # Bullet's file cache is keyed by name: it would return the old text of a changed description, and never shrink.
     bullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
     bullet.setGravity(0, 0, _GRAVITY_M_PER_S2, physicsClientId=client)
@@ -347,7 +337,7 @@ def _load(name: str, model: Model, client: int) -> tuple[int, tuple[str, ...]]:
                 number = None
     printed = "".join(output)
     if number is None:
-        raise DescriptionNotLoadable(name, " ".join(_messages(printed, "Error")) or "Bullet printed no reason")
+        raise poses.DescriptionNotLoadable(name, " ".join(_messages(printed, "Error")) or "Bullet printed no reason")
     return number, (*remarks, *_messages(printed, "Warning"), *_messages(printed, "Error"))
 
 
@@ -387,8 +377,8 @@ def _written(model: Model, folder: Path) -> tuple[str, tuple[str, ...]]:
                 lines.append(f"</{kind}>")
         lines.append("</link>")
     for joint in model.joints.values():
-        lower, upper = (min(max(each, -COORDINATE_MAX), COORDINATE_MAX) for each in joint.bounds)
-        endless = joint.kind is JointType.REVOLUTE and math.isinf(joint.bounds.upper - joint.bounds.lower)
+        lower, upper = (min(max(each, -poses.COORDINATE_MAX), poses.COORDINATE_MAX) for each in joint.bounds)
+        endless = joint.kind is poses.JointType.REVOLUTE and math.isinf(joint.bounds.upper - joint.bounds.lower)
         lines += [
             f"<joint name={quoteattr(joint.name)} type='{'continuous' if endless else joint.kind.name.lower()}'>",
             f"<parent link={quoteattr(joint.parent)}/>",
@@ -455,7 +445,7 @@ _STREAMS_LOCK = Lock()  # a process has one C stdout
 def library() -> Any:
     """Return the module of Bullet, imported at the first call: `pybullet` or else `pycram_bullet`.
 
-    Raises `EngineMissing` if neither is installed.
+    Raises `BulletMissing` if neither is installed.
     """
     for name in _PACKAGES:
         spec = find_spec(name)
@@ -466,7 +456,7 @@ def library() -> Any:
         ctypes.CDLL(spec.origin)
         with captured():
             return import_module(name)
-    raise EngineMissing("bullet")
+    raise poses.BulletMissing
 
 
 @cache

@@ -34,19 +34,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import Frame, rotation_matrix
 from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part
 from pycrorm_async.world.meshes import FileStatus, file_status, mesh_points, read_mesh
-from pycrorm_async.world.pose import (
-    DescriptionNotLoadable,
-    EngineMissing,
-    JointType,
-    Pose,
-    Quaternion,
-    Vector,
-    WorldMode,
-    WorldUnavailable,
-)
 from pycrorm_async.world.urdf_model import Joint, Model, Shape, origin
 
 Numbers: TypeAlias = NDArray[np.int32]
@@ -73,10 +64,10 @@ _FLOOR_SQUARES = (np.array([0.5, 0.65, 0.85]), np.array([0.95, 0.95, 0.95]))
 class MuJoCo:
     """The bodies of a world, and their collision shapes in a scene of MuJoCo."""
 
-    def __init__(self, mode: WorldMode) -> None:
+    def __init__(self, mode: poses.WorldMode) -> None:
         library()
-        if mode is WorldMode.GUI:
-            raise WorldUnavailable("MuJoCo opens no window here: use WorldMode.DIRECT, or engine='bullet'")
+        if mode is poses.WorldMode.GUI:
+            raise poses.WorldUnavailable("MuJoCo opens no window here: use WorldMode.DIRECT, or engine='bullet'")
         self._bodies: dict[int, _Body] = {}
         self._last = FLOOR
         self._collisions = _Scene()
@@ -101,7 +92,7 @@ class MuJoCo:
             try:
                 shapes[link] = tuple(_geom(shape, _GREY) for shape in each.collisions)
             except ValueError as fault:
-                raise DescriptionNotLoadable(name, f"collision of link {link!r}: {fault}") from fault
+                raise poses.DescriptionNotLoadable(name, f"collision of link {link!r}: {fault}") from fault
         self._last += 1
         body = self._bodies[self._last] = _Body(name, model)
         self._collisions.add(self._last, body, shapes)
@@ -116,7 +107,7 @@ class MuJoCo:
         self._collisions.remove(number)
         self._visuals = None
 
-    def place(self, number: int, root: Pose) -> None:
+    def place(self, number: int, root: poses.Pose) -> None:
         """Move the root link's frame to this pose."""
         self._bodies[number].root = root
         self._collisions.moved.add(number)
@@ -131,7 +122,7 @@ class MuJoCo:
         scene = self._collisions.current(self._bodies)
         numbers = [scene.links[number][link] for link in links]
         return [
-            (Vector(*position), Quaternion(x, y, z, w) if w >= 0 else Quaternion(-x, -y, -z, -w))
+            (poses.Vector(*position), poses.Quaternion(x, y, z, w) if w >= 0 else poses.Quaternion(-x, -y, -z, -w))
             for position, (w, x, y, z) in (
                 (scene.positions[each].tolist(), scene.quaternions[each].tolist()) for each in numbers
             )
@@ -222,7 +213,7 @@ class _Body:
     def __init__(self, name: str, model: Model) -> None:
         self.name = name
         self.model = model
-        self.root = Pose()
+        self.root = poses.Pose()
         self.positions: dict[str, float] = {}
         self.color: Color | None = None
 
@@ -232,7 +223,7 @@ class _Geom(NamedTuple):
 
     kind: str
     size: tuple[float, float, float]
-    at: Pose
+    at: poses.Pose
     color: Color
     mesh: _Triangles | None = None
 
@@ -305,9 +296,9 @@ class _Scene:
             pos=joint.origin.position, quat=(w, x, y, z), explicitinertial=True, mass=1.0, inertia=(1, 1, 1)
         )
         elements.links[joint.child] = link
-        if joint.kind is not JointType.FIXED:
+        if joint.kind is not poses.JointType.FIXED:
             kinds = self._library.mjtJoint
-            kind = kinds.mjJNT_SLIDE if joint.kind is JointType.PRISMATIC else kinds.mjJNT_HINGE
+            kind = kinds.mjJNT_SLIDE if joint.kind is poses.JointType.PRISMATIC else kinds.mjJNT_HINGE
             elements.joints[joint.name] = link.add_joint(type=kind, axis=joint.axis)
 
     def _add_shape(self, elements: _Elements, link: str, geom: _Geom) -> Any:
@@ -590,7 +581,7 @@ def _add_mesh(spec: Any, name: str, vertices: NDArray[Any], faces: NDArray[Any])
 def library() -> Any:
     """Return the module of MuJoCo, imported at the first call. Raises `EngineMissing`."""
     if find_spec("mujoco") is None:
-        raise EngineMissing("mujoco")
+        raise poses.EngineMissing("mujoco")
     mujoco: Any = import_module("mujoco")
     if mujoco.get_mju_user_warning() is None:  # otherwise MuJoCo would write to a file in the current folder
         mujoco.set_mju_user_warning(_log_warning)
