@@ -37,7 +37,6 @@ from pycrorm_async.world.urdf_model import Model, read_model, urdf_text
 if TYPE_CHECKING:
     from pycrorm_async.world.arms import Chain
 
-
 _log = logging.getLogger("pycrorm_async")
 
 
