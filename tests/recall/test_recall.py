@@ -15,7 +15,7 @@ import pytest_asyncio
 from pycrorm_async import Memory, Reading, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
-from pycrorm_async.recall import recall as running_cases
+from pycrorm_async.recall import running_cases
 from pycrorm_async.recall.answer import Answer, Relation
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import Recall
