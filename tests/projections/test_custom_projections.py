@@ -26,7 +26,7 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections import custom, pipeline
+from pycrorm_async.projections import custom_tables, pipeline
 from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection
 from pycrorm_async.projections.custom_tables import learner_of, states
 from pycrorm_async.projections.findings import TableDifference
@@ -178,7 +178,7 @@ async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
 ) -> None:
     monkeypatch.setattr(pipeline, "_NEWEST_EPISODES", 1)
     for name in ("_CHECK_S", "_SCAN_S_MAX"):
-        monkeypatch.setattr(custom, name, 1e9)
+        monkeypatch.setattr(custom_tables, name, 1e9)
     begun = [each for number in (1, 2, 3) for each in tries(number).records[:4]]
     projector = await folded(log, [*declarations(PICK_UP), *begun], GraspRate())
     # A process that folds the memory's own tables only leaves all three behind.
