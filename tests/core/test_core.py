@@ -507,7 +507,8 @@ def test_without_a_compiler_the_package_is_installed_runs_and_says_so_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CC", raising=False)
+    for name in ("CC", "PYCRORM_PURE"):
+        monkeypatch.delenv(name, raising=False)
     said = installed(tmp_path, RECORD)
     assert "-py3-none-any.whl" in said
     assert "it was installed without a C compiler" in said
