@@ -235,7 +235,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="200 episodes and one round, to check that it works")
     options = parser.parse_args()
     sizes = (50, 200 if options.quick else options.episodes)
-    line: dict[str, Any] = {"command": "one_episode", "episodes": list(sizes)}
+    line: dict[str, Any] = {"bench": "one_episode", "episodes": list(sizes)}
     gc.disable()
     with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder) / "server", syncs=False) as server:
         urls = {
