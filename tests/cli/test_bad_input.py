@@ -62,7 +62,7 @@ pytestmark = pytest.mark.slow
         (["copy"], 2, "missing option '--to'"),
         (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),
         (["run", "plans.py", "--seed", "x"], 2, "invalid value for '--seed'"),
-        (["run", "plans.py", "--writer", "x"], 2, "'x' is not one of 'thread', 'daemon'; `pycrorm run --help` lists"),
+        (["run", "plans.py", "--writer", "x"], 2, "'process', 'daemon'; `pycrorm run --help` lists"),
         (["run", "plans.py", "--colour", "x"], 2, "no such option: --colour"),
         (["run"], 2, "missing argument 'PLAN.py[:function]'"),
         (["xyz", "plans.py"], 2, "no such command 'xyz'; `pycrorm --help` lists the commands"),

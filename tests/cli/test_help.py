@@ -14,7 +14,7 @@ from pycrorm_async.cli.main import app, panels
 from tests.commands import COMMAND, environment, pycrorm
 
 pytestmark = pytest.mark.slow
-_LIGHT = {"cli", "cli.main", "errors", "moved_modules"}
+_LIGHT = {"cli", "cli.main", "errors", "lazy_names", "moved_modules"}
 """The modules of the package that the command needs to print its help."""
 
 

@@ -37,7 +37,7 @@ FORMS = [
     *(f"ask {each}" for each in ("durations", "arms_used", "successful_pick_ups", "episodes")),
     "ask root_failures --json", "ask object_history --name MILK", "ask moves_of --name MILK",
 ]  # fmt: skip
-NOT_TRIED = {"demo", "run", "learn", "plot", "mcp", "roles", "writer"}
+NOT_TRIED = {"demo", "import", "run", "learn", "plot", "mcp", "roles", "writer"}
 """Verbs that record, serve agents (`tests/integrations/mcp`), draw pictures only or print none of what is recorded."""
 
 

@@ -91,8 +91,9 @@ pytestmark = pytest.mark.slow
 #
 # The queries of the thesis, and the attributes of a row that are loaded without another query.
 
+named = [getattr(pycrorm_async.orm, each) for each in dir(pycrorm_async.orm)]
 CLASSES = sorted(
-    (each for each in vars(pycrorm_async.orm).values() if isinstance(each, type) and issubclass(each, Base)),
+    (each for each in named if isinstance(each, type) and issubclass(each, Base)),
     key=lambda each: each.__name__,
 )
 

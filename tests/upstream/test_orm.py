@@ -53,9 +53,10 @@ async def test_schema_creation(tmp_path: Path) -> None:
 async def test_node(planned: Recorded) -> None:
     # the root, 4 actions; 1 motion of the drive, 1 of the torso, 5 of the pick-up, 3 of the placing
     assert len(await planned.all(select(orm.TaskTreeNode))) == 1 + 4 + 10
-    # 4 objects when they were added; the robot's at each of 14 designators; targets: of 2 actions, of 1 drive, of
-    # 3 + 2 motions of the hand; moved: the robot once, the milk when it was lifted and when it was brought down
-    poses = 4 + 14 + 2 + 1 + 5 + 1 + 2
+    # 4 objects when they were added; targets: of 2 actions, of 3 + 2 motions of the hand, while the drive has that of
+    # its action; moved: the robot once, the milk when it was lifted and when it was brought down. A designator has the
+    # pose of the robot's row that was in force.
+    poses = 4 + 2 + 5 + 1 + 2
     assert len(await planned.all(select(orm.Pose))) == poses
     assert len(await planned.all(select(orm.Position))) == poses
     assert len(await planned.all(select(orm.Quaternion))) == poses
