@@ -19,7 +19,7 @@ from pycrorm_async import errors
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
-from pycrorm_async.events.types import EpisodeEnded, Happening
+from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.recall.cases import READS, EpisodeCases
 from pycrorm_async.recall.columns import Case
@@ -95,11 +95,10 @@ class ProcessCases:
             running = self._episodes.get(episode)
             if running is None and sequence == 1:
                 running = self._begin(episode)
-            if running is not None and sequence > running.reached:
+            if running is not None and sequence > running.reached and not running.has_ended:
                 kind, payload = type(happening), encode(happening)
                 identity = running.number, sequence, kind.__name__, kind.version
-                stored = StoredEvent(*identity, wall_ns, monotonic_ns, payload)
-                running.unnumbered += self._read(running, stored, happening)
+                running.unnumbered += self._read(running, [StoredEvent(*identity, wall_ns, monotonic_ns, payload)])
         cases += await self._numbered()
         return cases, [case for each in self._episodes.values() for case in each.unnumbered]
 
@@ -121,22 +120,24 @@ class ProcessCases:
             row = await episode_named(log, episode_text(episode))
             running = self._episodes[row.id] = _Running(row.id, row.number, is_numbered=True)
             async for page in log.pages(row):
-                happenings, undecodable = decode_events(page, _READS)
-                for stored, happening in zip(page, happenings, strict=False):
-                    cases += self._read(running, stored, happening)
-                if undecodable is not None:
-                    running.has_ended = True  # the fold of the tables parks the episode, with the reason
+                cases += self._read(running, page)
+                if running.has_ended:
                     break
         return cases
 
-    def _read(self, running: _Running, stored: StoredEvent, happening: Happening | None) -> Sequence[Case]:
-        running.reached = stored.sequence
-        running.has_ended = running.has_ended or stored.type == EpisodeEnded.__name__
-        if happening is None:
-            return ()
+    def _read(self, running: _Running, events: Sequence[StoredEvent]) -> Sequence[Case]:
+        """Fold the next events from their payloads.
+
+        An observed event itself has poses and references to objects where a decoded one has JSON.
+        """
+        happenings, undecodable = decode_events(events, _READS)
+        decoded = [(event, each) for event, each in zip(events, happenings, strict=False) if each is not None]
         cases: list[Case] = []
-        if running.fold.read([(stored, happening)], self.emitter.feed.declaration, cases) is not None:
-            running.has_ended = True  # as above
+        refused = running.fold.read(decoded, self.emitter.feed.declaration, cases)
+        running.reached = events[-1].sequence
+        # The fold of the tables parks the episode at an event that is undecodable or refused, with the reason.
+        is_parked = undecodable is not None or refused is not None
+        running.has_ended = is_parked or events[-1].type == EpisodeEnded.__name__
         return cases
 
     async def _numbered(self) -> list[Case]:

@@ -17,7 +17,7 @@ from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.recall.blocks import Block, CaseLibrary
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.experience import TRIES_MAX, Tries, best_first, tries_of
-from pycrorm_async.recall.recall import present_situation
+from pycrorm_async.recall.recall import Recall, present_situation
 from pycrorm_async.world import BulletWorld, Object, Pose
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
@@ -151,6 +151,21 @@ async def inspect(milk: Object) -> None:
         await InspectActionPerformable(designator).perform()
     except PlanFailure:
         return
+
+
+async def test_an_action_with_an_object_is_recalled_before_it_is_stored_as_it_is_afterwards() -> None:
+    async with Memory.open("sqlite://") as memory:
+        with BulletWorld(), simulated_robot:
+            milk = Object("milk", ObjectType.MILK, pose=Pose([2.0, 0.5, 0.9]))
+            Object("bowl", ObjectType.BOWL, pose=Pose([2.1, 0.4, 0.9]))
+            async with memory.episode():
+                assert list(await memory.recall(InspectActionPerformable)) == []
+                await inspect(milk)
+                [found] = await memory.recall(InspectActionPerformable)
+                assert (found.status, found.symbols["near"]) == ("FAILED", ("BOWL",))
+        await memory.flush()
+        [stored] = await Recall.of(memory.reading)(InspectActionPerformable)
+        assert found.case._replace(started_us=0, duration_s=0) == stored.case._replace(started_us=0, duration_s=0)
 
 
 @pytest.mark.slow
