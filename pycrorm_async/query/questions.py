@@ -809,22 +809,23 @@ class Ask(Generic[Q]):
 
         `memory.samples(stream)` returns one as a frame.
         """
-        observation, block = orm.Observation, aliased(orm.ObservationValue)
-        count, channels = aliased(orm.ObservationValue), aliased(orm.ObservationValue)
+        observation, values = orm.Observation.__table__, orm.ObservationValue.__table__
+        block, count, channels = (values.alias() for _ in range(3))
+        joined = partial(_joined, episode)
         statement = (
             sa.select(
-                observation.process_metadata_id.label("episode"),
-                observation.name.label("stream"),
-                sa.cast(sa.func.max(channels.number), sa.Integer).label("channels"),
-                sa.cast(sa.func.sum(count.number), sa.Integer).label("samples"),
-                sa.func.max(observation.time).label("time"),
+                observation.c.process_metadata_id.label("episode"),
+                observation.c.name.label("stream"),
+                sa.cast(sa.func.max(channels.c.number), sa.Integer).label("channels"),
+                sa.cast(sa.func.sum(count.c.number), sa.Integer).label("samples"),
+                sa.func.max(observation.c.time).label("time"),
             )
-            .join(block, (block.id == observation.id) & (block.media_type == SAMPLES))
-            .join(count, (count.id == observation.id) & (count.key == "samples"))
-            .join(channels, (channels.id == observation.id) & (channels.key == "channels"))
-            .where(frames.of_episode(observation.process_metadata_id, episode))
-            .group_by(observation.process_metadata_id, observation.name)
-            .order_by(observation.process_metadata_id, observation.name)
+            .join(block, joined(observation.c.id, block, observation) & (block.c.media_type == SAMPLES))
+            .join(count, joined(observation.c.id, count, observation) & (count.c.key == "samples"))
+            .join(channels, joined(observation.c.id, channels, observation) & (channels.c.key == "channels"))
+            .where(frames.of_episode(observation.c.process_metadata_id, episode))
+            .group_by(observation.c.process_metadata_id, observation.c.name)
+            .order_by(observation.c.process_metadata_id, observation.c.name)
         )
         return frames.limited(statement, limit)
 
