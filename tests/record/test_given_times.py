@@ -262,10 +262,10 @@ def test_an_import_runs_beside_a_live_memory(tmp_path: Path) -> None:
             record_drives(memory.recording, "drives.log", 3)
         episode.observe("after", 2)
     assert_verified(tmp_path)
-    assert rows(tmp_path, "SELECT description, status FROM process_metadata ORDER BY id") == [
-        ("live", "SUCCEEDED"),
+    assert rows(tmp_path, "SELECT description, status FROM process_metadata ORDER BY description") == [
         ("an import", "SUCCEEDED"),
-    ]
+        ("live", "SUCCEEDED"),
+    ]  # by number they come in the order in which they were stored
 
 
 def test_two_processes_that_record_one_name_are_refused_in_one_line(tmp_path: Path) -> None:

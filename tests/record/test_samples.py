@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def test_samples_are_the_same_numbers_and_times_in_a_frame(tmp_path: Path) -> No
 
 def test_a_number_takes_less_than_thirty_bytes_on_disk(tmp_path: Path) -> None:
     def size() -> int:
-        with sqlite3.connect(tmp_path / "memory.db") as database:
+        with closing(sqlite3.connect(tmp_path / "memory.db")) as database:
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return (tmp_path / "memory.db").stat().st_size
 
