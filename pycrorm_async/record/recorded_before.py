@@ -85,7 +85,7 @@ class RecordedBefore:
             raise CallerError(
                 f"event {stored.sequence} of the episode {episode_text(self._episode)}, a {stored.type}, differs from"
                 f" the {heading.type} that is reported now: the source has changed since, so nothing more is recorded;"
-                " give the episode another name to record it anew"
+                " give the episode another name to record it too"
             )
         self._last = stored.sequence
         return stored.sequence

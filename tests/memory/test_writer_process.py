@@ -227,11 +227,10 @@ async def test_two_memories_of_one_database_have_a_process_each_and_store_everyt
     assert (processes(), Spool(tmp_path / "spool").recorders()) == ([], [])
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_process_leaves_other_living_recorders_to_their_writers_and_drains_dead_ones(
     tmp_path: Path, database_url: str, daemon: Start, spool: Path
 ) -> None:
-    if database_url.startswith("postgresql"):
-        pytest.skip("the same claims")
     async with Memory.open(database_url, spool=spool, writer="daemon", settings=QUICKLY_SYNCED) as other:
         await NoteActionPerformable("of another").perform()
         await other.synced()

@@ -310,7 +310,7 @@ def test_the_demonstration_ends_alike_in_every_engine() -> None:
 @pytest.mark.slow
 @of_every_engine()
 def test_bodies_keep_their_shapes_while_others_come_and_go(world: BulletWorld) -> None:
-    """An engine may number its shapes anew after each change."""
+    """An engine may number its shapes differently after each change."""
     rng = random.Random(17)
     present: dict[str, Object] = {}
     for n in range(200):
