@@ -25,7 +25,7 @@ from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, Tally, batch_r
 from pycrorm_async.plan import PlanFailure
 from pycrorm_async.plan.locations import surface_poses
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, WorldMode, copied
-from pycrorm_async.world.engines import Engine, Part, engine_class
+from pycrorm_async.world.engines import FLOOR, SKY, Engine, Part, engine_class
 from pycrorm_async.world.kinematics import solve
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import (
@@ -286,6 +286,16 @@ def test_a_picture_shows_the_same_object_at_999_of_1000_pixels(engine: str) -> N
     same = names_ == expected
     assert same.mean() >= 0.999
     assert np.median(np.abs(depths - depths_expected)[same]) < 1e-3
+
+
+@pytest.mark.parametrize("engine", WITH_SHAPES)
+def test_a_camera_below_the_floor_sees_through_it(engine: str) -> None:
+    with BulletWorld(engine=engine) as world:
+        milk = Object("milk", ObjectType.MILK, pose=Pose([0, 0, 0.3]))
+        bodies = photograph(world, Camera(milk.pose.position, 1.0, 20, pitch_deg=-40), 80, 60, smooth=False).bodies
+        assert {*bodies.ravel().tolist()} == {SKY, milk.body.number}
+        assert world.ray_test([(1, 1, -1)], [(1, 1, 1)]) == [None]
+        assert world.engine.first_met([(1, 1, -1)], [(1, 1, 1)], ()) == [FLOOR]
 
 
 def demonstration(engine: str | type[Engine]) -> dict[str, Pose]:

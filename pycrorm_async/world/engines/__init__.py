@@ -170,7 +170,7 @@ class Engine(Protocol):
         ...
 
     def render(self, camera: Camera, width: int, height: int, *, shadows: bool) -> Image:
-        """Return what the camera sees of the visual shapes."""
+        """Return what the camera sees of the visual shapes; from below it sees through the floor."""
         ...
 
     def paint(self, number: int, color: Color) -> None:

@@ -168,7 +168,7 @@ class MuJoCo:
     def render(self, camera: Camera, width: int, height: int, *, shadows: bool) -> Image:  # noqa: ARG002  see above
         """Return a picture, for each pixel the color that the light gives to the surface its ray meets."""
         if self._visuals is None:
-            self._visuals = scene = _Scene()
+            self._visuals = scene = _Scene(floor_sides=1)
             for number, body in self._bodies.items():
                 scene.add(number, body, _visual_geoms(body))
         self._visuals.moved.update(self._bodies)
@@ -248,6 +248,9 @@ class _Hits(NamedTuple):
 class _Scene:
     """A specification of bodies with a floor, and what was compiled of it.
 
+    Args:
+        floor_sides: 1 for a floor that is met from above only, as a camera sees it; 2 for one that rays meet.
+
     Attributes:
         moved: numbers of bodies whose state differs from that in the data.
         links: for each body MuJoCo's numbers of its links.
@@ -264,7 +267,7 @@ class _Scene:
     positions: Floats
     quaternions: Floats
 
-    def __init__(self) -> None:
+    def __init__(self, *, floor_sides: int = 2) -> None:
         self._library = library()
         self._spec = self._library.MjSpec()
         self._spec.compiler.usethread = False
@@ -275,7 +278,7 @@ class _Scene:
         self._boxes: tuple[Floats, Floats] | None = None
         self.moved: set[int] = set()
         plane = self._library.mjtGeom.mjGEOM_PLANE
-        for turn in ((1, 0, 0, 0), (0, 1, 0, 0)):  # a plane is met from one side only
+        for turn in ((1, 0, 0, 0), (0, 1, 0, 0))[:floor_sides]:  # a plane is met from one side only
             self._spec.worldbody.add_geom(type=plane, size=[0, 0, 1], quat=turn)
 
     def add(self, number: int, body: _Body, shapes: Mapping[str, Sequence[_Geom]]) -> None:
