@@ -497,16 +497,17 @@ def _shape(element: Element, owner: str, colors: Mapping[str, tuple[float, ...]]
     if shape is None:
         left_out.append(f"{owner}: it has no geometry")
         return None
+    file = shape.get("filename", "") if shape.tag == "mesh" else ""
     if shape.tag == "mesh":
-        scale = _numbers(shape, "scale", 3, owner, (1.0, 1.0, 1.0))
-        return Shape("mesh", scale, shape.get("filename", ""), xyz, rpy, color)
-    if shape.tag not in _SIZES:
+        sizes = _numbers(shape, "scale", 3, owner, (1.0, 1.0, 1.0))
+    elif shape.tag in _SIZES:
+        sizes = tuple(number for name, count in _SIZES[shape.tag] for number in _numbers(shape, name, count, owner))
+    else:
         left_out.append(f"{owner}: <{shape.tag}> is no shape of URDF")
         return None
-    sizes = [number for name, count in _SIZES[shape.tag] for number in _numbers(shape, name, count, owner)]
     if not all(map(math.isfinite, sizes)):
-        raise UrdfFault(f"{owner}: <{shape.tag}> holds {sizes}; numbers must be finite")
-    return Shape(shape.tag, tuple(sizes), "", xyz, rpy, color)
+        raise UrdfFault(f"{owner}: <{shape.tag}> holds {[*sizes]}; numbers must be finite")
+    return Shape(shape.tag, sizes, file, xyz, rpy, color)
 
 
 def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint:

@@ -156,6 +156,10 @@ WORDS = {
         SHAPE.format(kind="visual", shape='<geometry><mesh filename="a.stl" scale="1 1"/></geometry>'),
         "scale",
     ),
+    "a scale without end": (
+        SHAPE.format(kind="visual", shape='<geometry><mesh filename="a.stl" scale="inf 1 1"/></geometry>'),
+        "link 'base' visual: <mesh> holds [inf, 1.0, 1.0]; numbers must be finite",
+    ),
     "a colour": (SHAPE.format(kind="visual", shape='<material name="m"><color rgba="1 0 red 1"/></material>'), "'red'"),
     "a mass": ('<robot name="r"><link name="l"><inertial><mass value="1kg"/></inertial></link></robot>', "'1kg'"),
     "xacro": (

@@ -534,8 +534,6 @@ def _color(shape: Shape) -> Color:
 @lru_cache(maxsize=512)
 def _hull(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangles:
     """Return the convex hull of a mesh file's points; a flat one is made 1 mm thick. Raises `ValueError`."""
-    if not all(map(math.isfinite, scale)):
-        raise ValueError(f"mesh {path}: its scale is not finite")
     points = mesh_points(path) * scale
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=True)
