@@ -26,12 +26,14 @@ from pycrorm_async.plan import PlanFailure
 from pycrorm_async.plan.locations import surface_poses
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, WorldMode, copied
 from pycrorm_async.world.engines import FLOOR, SKY, Engine, Part, engine_class
+from pycrorm_async.world.engines.mujoco import MuJoCo
 from pycrorm_async.world.kinematics import solve
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import (
     AttachmentRefused,
     DescriptionNotLoadable,
     JointLimitExceeded,
+    Vector,
     WorldUnavailable,
     yaw_quaternion,
 )
@@ -298,6 +300,29 @@ def test_a_camera_below_the_floor_sees_through_it(engine: str) -> None:
         assert world.engine.first_met([(1, 1, -1)], [(1, 1, 1)], ()) == [FLOOR]
 
 
+@pytest.mark.parametrize("engine", WITH_SHAPES)
+def test_each_picture_shows_what_was_added_moved_and_removed_since_the_last_one(engine: str) -> None:
+    with BulletWorld(engine=engine) as world:
+
+        def colors() -> dict[str, list[float]]:
+            """Return the greatest red, green and blue of each object in the picture."""
+            picture = photograph(world, Camera(Vector(0, 0, 1), 1.0, 0), 80, 60, smooth=False)
+            seen = {each.name: picture.pixels[picture.bodies == each.body.number] for each in world.objects}
+            return {name: pixels.max(axis=0).tolist() for name, pixels in seen.items() if len(pixels)}
+
+        red = Object("red", ObjectType.MILK, pose=Pose([0, 0, 1]), color=(1, 0, 0, 1))
+        assert colors() == {"red": pytest.approx([220, 0, 0], abs=35)}
+        green = Object("green", ObjectType.BREAKFAST_CEREAL, pose=Pose([0.3, 0, 1.2]))
+        assert colors() == {"green": pytest.approx([50, 175, 75], abs=20)}
+        green.set_pose(Pose([-0.3, 0.3, 1]))
+        assert {*colors()} == {"red", "green"}
+        green.set_pose(red.pose)
+        red.set_pose(Pose([0.5, 0, 1.3]))
+        assert {*colors()} == {"red"}
+        red.remove()
+        assert {*colors()} == {"green"}
+
+
 def demonstration(engine: str | type[Engine]) -> dict[str, Pose]:
     with kitchen_of(engine) as world:
         asyncio.run(breakfast())
@@ -355,6 +380,17 @@ def test_a_thousand_bodies_come_and_go(engine: str) -> None:
             cup.remove()
         assert world.ray_test([(1, 0, 3)], [(1, 0, 0.1)]) == [None]
         assert world.objects == (robot,)
+
+
+def test_mujoco_keeps_a_mesh_as_long_as_a_body_has_it(tmp_path: Path) -> None:
+    with BulletWorld(engine="mujoco") as world:
+        assert isinstance(world.engine, MuJoCo)
+        text = shape("mesh", tmp_path)
+        meshes = [Object(str(n), ObjectType.GENERIC_OBJECT, text) for n in range(3)]
+        for left, each in ((2, meshes[0]), (1, meshes[2]), (0, meshes[1])):
+            each.remove()
+            assert world.ray_test([(0, 0, 1)], [(0, 0, 0.05)]) == [meshes[1] if left else None]
+            assert world.engine._collisions.model.nmesh == min(left, 1)
 
 
 @pytest.mark.slow
