@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world.bounding_boxes import Frame
-from pycrorm_async.world.pose import EngineMissing, Pose, Vector, WorldMode
+from pycrorm_async.world.pose import EngineMissing, Pose, Quaternion, Vector, WorldMode
 from pycrorm_async.world.urdf_model import Model
 
 Color: TypeAlias = tuple[float, float, float, float]
@@ -112,6 +112,12 @@ class Image(NamedTuple):
     colors: Floats
     bodies: NDArray[np.int32]
     depths: Floats
+
+
+def frame_of(position: Sequence[float], turn: Sequence[float]) -> Frame:
+    """Return the frame at a position with a rotation (x, y, z, w); of the two quaternions of it, that with w >= 0."""
+    x, y, z, w = turn
+    return Vector(*position), Quaternion(x, y, z, w) if w >= 0 else Quaternion(-x, -y, -z, -w)
 
 
 class Engine(Protocol):

@@ -28,7 +28,7 @@ import numpy as np
 
 from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, box_of, rotation_matrix
-from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part
+from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of
 from pycrorm_async.world.meshes import is_read_by_bullet, mesh_points, points_as_stl
 from pycrorm_async.world.urdf_model import Model, Shape, along
 
@@ -149,7 +149,7 @@ class Bullet:
         body = self._bodies[number]
         if body.by_chain:
             placed = [body.root @ along(body.model.paths[link], body.positions) for link in links]
-            return [(each.position, each.orientation) for each in placed]
+            return [frame_of(each.position, each.orientation) for each in placed]
         if len(links) == 1 and (only := body.links[links[0]]) != _ROOT:
             state = self._bullet.getLinkState(number, only, computeForwardKinematics=True, physicsClientId=self.client)
             return [_frame(state)]
@@ -161,7 +161,7 @@ class Bullet:
                 number, below, computeForwardKinematics=True, physicsClientId=self.client
             )
         frames = {each: _frame(state) for each, state in zip(below, states, strict=True)}
-        frames[_ROOT] = body.root.position, body.root.orientation
+        frames[_ROOT] = frame_of(body.root.position, body.root.orientation)
         return [frames[each] for each in numbers]
 
     # --- queries ----------------------------------------------------------------------------------------------
@@ -292,7 +292,7 @@ class Bullet:
 
 def _frame(state: Sequence[Any]) -> Frame:
     """Return the frame of a link's centre of mass, which is in the link's own frame, but in double precision."""
-    return poses.Vector(*state[0]), poses.Quaternion(*state[1])
+    return frame_of(state[0], state[1])
 
 
 def _connect(mode: poses.WorldMode) -> int:

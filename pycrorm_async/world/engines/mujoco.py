@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import Frame, rotation_matrix
-from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part
+from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of
 from pycrorm_async.world.meshes import FileStatus, file_status, mesh_points, read_mesh
 from pycrorm_async.world.urdf_model import Joint, Model, Shape, origin
 
@@ -121,12 +121,8 @@ class MuJoCo:
         """Return the frames of links."""
         scene = self._collisions.current(self._bodies)
         numbers = [scene.links[number][link] for link in links]
-        return [
-            (poses.Vector(*position), poses.Quaternion(x, y, z, w) if w >= 0 else poses.Quaternion(-x, -y, -z, -w))
-            for position, (w, x, y, z) in (
-                (scene.positions[each].tolist(), scene.quaternions[each].tolist()) for each in numbers
-            )
-        ]
+        frames = ((scene.positions[each].tolist(), scene.quaternions[each].tolist()) for each in numbers)
+        return [frame_of(position, (x, y, z, w)) for position, (w, x, y, z) in frames]
 
     # --- queries ----------------------------------------------------------------------------------------------
 
