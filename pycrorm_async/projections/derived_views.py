@@ -245,10 +245,12 @@ _STARTED_BY: Final = (
 _POSE_OF: Final = '"pose_of":'
 _PARAMETERS_SQLITE: Final = f"""(SELECT CASE WHEN json_valid(payload) AND instr(payload, '{_POSE_OF}') THEN (
  SELECT json_group_object(part.key, json(coalesce((
-   SELECT named.payload -> ('$.parameters."' || json_extract(part.value, '$.field') || '"') FROM event AS named
+   SELECT CASE WHEN json_valid(named.payload)
+     THEN named.payload -> ('$.parameters."' || json_extract(part.value, '$.field') || '"') END FROM event AS named
    WHERE named.episode = event.episode
     AND named.sequence = CASE WHEN part.type = 'object' THEN json_extract(part.value, '$.pose_of') END),
-  event.payload -> part.fullkey))) FROM json_each(event.payload, '$.parameters') AS part)
+  CASE WHEN part.type = 'object' THEN part.value ELSE event.payload -> part.fullkey END)))
+  FROM json_each(event.payload, '$.parameters') AS part)
  WHEN json_valid(payload) THEN json_extract(payload, '$.parameters') END
  FROM event WHERE {_STARTED_BY})"""  # noqa: S608
 _PARAMETERS_POSTGRESQL: Final = f"""(SELECT CASE WHEN payload NOT LIKE '{{{{%}}}}' THEN NULL
@@ -256,7 +258,7 @@ _PARAMETERS_POSTGRESQL: Final = f"""(SELECT CASE WHEN payload NOT LIKE '{{{{%}}}
   SELECT '{{{{' || string_agg(CAST(to_json(part.key) AS text) || ':' || CAST(coalesce((
     SELECT CAST(named.payload AS json) -> 'parameters' -> (part.value ->> 'field') FROM event AS named
     WHERE named.episode = event.episode AND named.sequence =
-     CASE WHEN json_typeof(part.value) = 'object' THEN CAST(part.value ->> 'pose_of' AS bigint) END),
+     CASE WHEN (part.value ->> 'pose_of') ~ '^[0-9]{{{{1,9}}}}$' THEN CAST(part.value ->> 'pose_of' AS bigint) END),
    part.value) AS text), ',') || '}}}}' FROM json_each(CAST(event.payload AS json) -> 'parameters') AS part)
  ELSE CAST(CAST(payload AS json) -> 'parameters' AS text) END
  FROM event WHERE {_STARTED_BY})"""  # noqa: S608

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 
+import pytest
+import sqlalchemy as sa
+
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -76,6 +79,38 @@ async def test_views_have_the_parameters_with_the_pose_and_the_tables_have_one_r
     assert await ask(log, "SELECT target_location_id FROM navigate_action") == [(row(3, 2),)]
     poses = await ask(log, "SELECT id, x, y FROM pose WHERE x > 0 ORDER BY id")
     assert poses == [(row(3, 2), 1.0, 2.0), (row(7, 2), 0.5, 0.0)]
+
+
+async def test_views_survive_what_only_looks_like_a_name_of_a_pose(log: EventLog) -> None:
+    label = declared("LabelAction", "label_action", field("texts", "dict", 2, item="text"))
+    script = Script()
+    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(NodeStarted("root"))
+    given = [{"texts": {"pose_of": text}} for text in ("milk", "1.5", "9" * 30)]
+    given += [{"texts": {"pose_of": "2", "field": "x"}, 'a"b': {"missing": "why", "repr": "c"}}]
+    for parameters in given:
+        script.put(NodeStarted("action", root, name_of(label), parameters))
+    projector = Projector(log)
+    await projector.open()
+    await log.append([*declarations(label), *script.records])
+    await projector.catch_up()
+    for view in ("designator", "action"):
+        rows = await ask(log, f"SELECT parameters FROM {view} ORDER BY id")
+        assert [json.loads(text) for (text,) in rows] == given
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+async def test_a_damaged_event_hides_its_pose_and_not_the_nodes_that_name_it(log: EventLog) -> None:
+    projector = Projector(log)
+    await projector.open()
+    await log.append([*declarations(GO, NAVIGATE, MOVE), *_script().records])
+    await projector.catch_up()
+    async with log.engine.begin() as connection:
+        await connection.execute(sa.text("DROP TRIGGER event_is_not_updated"))
+        await connection.execute(sa.text("UPDATE event SET payload = replace(payload, ':', ';') WHERE sequence = 3"))
+    rows = await ask(log, "SELECT id, parameters FROM designator ORDER BY id LIMIT 3")
+    reference = {"pose_of": 3, "field": "place", "slot": 2}
+    assert [json.loads(text) for _, text in rows] == [{}, {"target_location": reference}, {"target": reference}]
 
 
 async def test_a_moment_of_the_episode_has_the_pose(log: EventLog) -> None:
