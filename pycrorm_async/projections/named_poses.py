@@ -56,7 +56,7 @@ class NamedPoses:
     async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
         """Note these events, and those that they name."""
         self.note(events)
-        named = {(event.number, sequence) for event in events for sequence in _named_by(event)}
+        named = {(each.number, name) for each in events for name in _named_by(each) if 0 < name < each.sequence}
         if missing := sorted(named - self._events.keys()):
             self.note(await log.spans([Span(number, sequence - 1, sequence) for number, sequence in missing]))
 

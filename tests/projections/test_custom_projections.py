@@ -574,3 +574,15 @@ async def test_a_projection_gets_the_pose_of_the_robot_that_a_node_names_by_a_ro
     assert targets == [("[7,8,0.0]",)] * 2
     result = await verify(log, projections=[Stands()])
     assert (result.drift, result.damage, result.not_compared) == (0, 0, {})
+
+
+@pytest.mark.parametrize("sequence", [2**70, -(2**70), 0])
+async def test_an_event_that_names_no_earlier_one_is_refused_alone(log: EventLog, sequence: int) -> None:
+    script, other = Script(1), tries(2)
+    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(NodeStarted("root"))
+    named = PoseReference(sequence, "target", 2)
+    script.put(NodeStarted("motion", root, name_of(MOVE), {"target": named}, RobotValue(None, "ROBOT")))
+    await folded(log, [*declarations(MOVE, PICK_UP), *mixed(script, other)], Stands())
+    states = await ask(log, "SELECT number, head - folded, parked IS NULL FROM episode ORDER BY number")
+    assert states == [(1, 1, False), (2, 0, True)]
