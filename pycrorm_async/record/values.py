@@ -694,8 +694,8 @@ _ARGS: Final = BaseException.__dict__["args"].__get__
 class FailureCopies:
     """Copies exceptions for one episode. An exception that several nodes raise on its way up is copied once.
 
-    It is copied again when its arguments or its message are others. The copy does not keep the exception, and with it
-    the frames of its traceback, alive.
+    It is copied again when its arguments or its message are others, or an argument may have changed in place. The copy
+    does not keep the exception, and with it the frames of its traceback, alive.
     """
 
     def __init__(self) -> None:
@@ -713,8 +713,9 @@ class FailureCopies:
             if copied() is failure and former_arguments is arguments and former_message == message:
                 return value
         value = failure_value(failure, references, convert)
-        with suppress(TypeError):  # of a built-in class, to which there are no weak references
-            self._last = ref(failure), arguments, message, value
+        if all(type(each) in _PLAIN for each in arguments):
+            with suppress(TypeError):  # of a built-in class, to which there are no weak references
+                self._last = ref(failure), arguments, message, value
         return value
 
 

@@ -224,3 +224,11 @@ def test_an_exception_whose_message_changes_on_its_way_up_is_copied_again() -> N
     assert copies.copy(failure, NO_REFERENCES).message == "first"
     failure.text = "second"
     assert copies.copy(failure, NO_REFERENCES).message == "second"
+
+
+def test_an_exception_whose_argument_changes_in_place_is_copied_again() -> None:
+    copies, tried = FailureCopies(), ["left"]
+    failure = PlanFailure("no arm reaches it", tried)
+    assert copies.copy(failure, NO_REFERENCES).arguments == ["no arm reaches it", ["left"]]
+    tried.append("right")
+    assert copies.copy(failure, NO_REFERENCES).arguments == ["no arm reaches it", ["left", "right"]]
