@@ -633,7 +633,8 @@ class CustomRows(ProjectedBatch):
             declaration = self._declared.get(happening.designator)
             if declaration is None:
                 raise CannotFold(f"the designator type {happening.designator} was never declared")
-            dtype, parameters = declaration.dtype, happening.parameters
+            # A copy, because another projection gets the same happening, and a fold may take parameters out.
+            dtype, parameters = declaration.dtype, dict(happening.parameters)
             if b'"missing"' in payload:  # only then can a parameter be a `MissingValue`, so most events skip the copy
                 parameters = {name: None if is_missing(each) else each for name, each in parameters.items()}
         time_us = microseconds(wall_ns)

@@ -576,6 +576,22 @@ async def test_a_projection_gets_the_pose_of_the_robot_that_a_node_names_by_a_ro
     assert (result.drift, result.damage, result.not_compared) == (0, 0, {})
 
 
+class Emptied(Projection):
+    name, version = "emptied", 1
+    tables = {"emptied": {"arm": "text"}}  # noqa: RUF012 - a common form in user code
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        parameters: Any = event.parameters
+        if event.dtype is not None:
+            rows.insert("emptied", event.id, arm=parameters.pop("arm"))
+
+
+async def test_a_fold_that_takes_parameters_out_leaves_them_to_the_next_projection(log: EventLog) -> None:
+    await folded(log, [*declarations(PICK_UP), *tries().records], Emptied(), GraspRate())
+    assert await visible_rows(log) == rows_of(1)
+    assert await ask(log, "SELECT id, arm FROM emptied ORDER BY id") == [(key, arm) for key, _, arm, *_ in rows_of(1)]
+
+
 @pytest.mark.parametrize("sequence", [2**70, -(2**70), 0])
 async def test_an_event_that_names_no_earlier_one_is_refused_alone(log: EventLog, sequence: int) -> None:
     script, other = Script(1), tries(2)
