@@ -96,7 +96,7 @@ async def _stored_ids(place: Place) -> set[str]:
 def _print(report: ImportReport, *, as_json: bool) -> None:
     left_out = [{"what": what, "why": why, "count": count} for (what, why), count in report.left_out.most_common()]
     if as_json:
-        episodes: list[dict[str, Any]] = [asdict(each) for each in report.episodes]
+        episodes: list[dict[str, Any]] = [asdict(each) | {"statuses": each.statuses} for each in report.episodes]
         output.print_json({"format": report.format, "episodes": episodes, "left_out": left_out, "cut": report.cut})
         return
     rows = [

@@ -19,7 +19,7 @@ from collections.abc import Callable, Container, Hashable, Iterable, Mapping, Se
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias, cast, get_args
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias, cast, get_args
 
 import msgspec
 
@@ -48,7 +48,12 @@ _NAME_MAX = 50
 """Bounds the characters of the name of a type or a field: PostgreSQL cuts names of tables at 63 bytes."""
 _END_STATUSES = frozenset(get_args(EpisodeStatus)) - {"RUNNING"}
 
+TIMES: Final = range(-(2**63), 2**63)
+"""The times that can be recorded, in ns since 1970: from 1677 to 2262."""
+
 Numbers: TypeAlias = Sequence[float]
+Rate: TypeAlias = Annotated[float, msgspec.Meta(ge=1e-6)]
+"""A rate of a map file in Hz."""
 
 
 class ObjectKey(NamedTuple):
@@ -178,7 +183,9 @@ class Intake:
             metadata: JSON values; the name of the format is added as `import`.
         """
         settings, format_name = self.settings, self.report.format
+        at = self.in_range(at)
         full_name = "/".join(filter(None, ("import", format_name, settings.name, name)))
+        full_name = full_name.encode(errors="backslashreplace").decode()
         identity, text = episode_text(named_episode_id(full_name)), settings.description or description
         report = EpisodeReport(identity, text, "imported" if self.recording is not None else "would be imported")
         self.report.episodes.append(report)
@@ -201,6 +208,13 @@ class Intake:
     def left_out(self, what: str, why: str, count: int = 1) -> None:
         """Count parts of a file that are not recorded."""
         self.report.left_out[what, why] += count
+
+    def in_range(self, at: int) -> int:
+        """Return a time that 64 bits hold; of another one, count it and return the nearest."""
+        if at in TIMES:
+            return at
+        self.left_out("times", "they are before 1677 or after 2262; the nearest moment takes their place")
+        return max(TIMES.start, min(at, TIMES.stop - 1))
 
     def cut(self, path: Path, reason: str) -> None:
         """Note that the rest of a file cannot be read."""
@@ -280,7 +294,7 @@ class IntakeEpisode:
         robot: Hashable | None = None,
     ) -> None:
         """Record that a node started. Its fields have the types of the values: texts, numbers, booleans, poses."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         if self.is_stored:
             return
         self._report.nodes += 1
@@ -301,7 +315,7 @@ class IntakeEpisode:
         untimed: bool = False,
     ) -> None:
         """Record that a node ended, `untimed` if it is not known when; nothing if it is not open."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         if key not in self._open:
             return
         del self._open[key]
@@ -326,7 +340,7 @@ class IntakeEpisode:
         urdf: str | None = None,
     ) -> None:
         """Record that an object is in the world from now on."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         if self.is_stored:
             return
         self._report.objects += 1
@@ -341,7 +355,7 @@ class IntakeEpisode:
 
     def object_moved(self, key: Hashable, pose: PoseValue, at: int) -> None:
         """Record the pose of an object that was added, unless it is the same as before."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         numbers = (*pose.position, *pose.orientation)
         if self.is_stored or self._poses.get(key, numbers) == numbers:
             return
@@ -352,7 +366,7 @@ class IntakeEpisode:
 
     def object_removed(self, key: Hashable, at: int) -> None:
         """Record that an object left the world; nothing if it is not there."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         if self._poses.pop(key, None) is None:
             return
         del self._joints[key]
@@ -362,7 +376,7 @@ class IntakeEpisode:
 
     def joints_moved(self, key: Hashable, joints: Mapping[str, float], at: int) -> None:
         """Record the positions of joints (rad or m) that have changed and are finite."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         before = self._joints.get(key)
         if self.is_stored or before is None:
             return
@@ -378,7 +392,7 @@ class IntakeEpisode:
         """Record samples of a stream: a row of numbers, one for each channel, for each time."""
         if len(at) == 0:
             return
-        self._last = max(self._last, int(max(at)))
+        self._timed(int(max(at)))
         if self.is_stored:
             return
         self._report.samples += len(at)
@@ -387,7 +401,7 @@ class IntakeEpisode:
 
     def observe(self, name: str, values: object, at: int, *, node: Hashable | None = None) -> None:
         """Record an observation, of the node if that is open or ended a short time ago, else of the episode."""
-        self._last = max(self._last, at)
+        at = self._timed(at)
         if self.is_stored:
             return
         self._report.observations += 1
@@ -399,7 +413,13 @@ class IntakeEpisode:
         """Set how the episode ended, and when, if that is after its last event; by default UNKNOWN."""
         is_known = isinstance(status, str) and status in _END_STATUSES
         self._status = cast("EpisodeStatus", status) if is_known else "UNKNOWN"
-        self._last = max(self._last, at or 0)
+        self._timed(at or 0)
+
+    def _timed(self, at: int) -> int:
+        """Return a time as it can be recorded, and note that the episode lasts until then."""
+        at = self._intake.in_range(at)
+        self._last = max(self._last, at)
+        return at
 
     def _end_all(self) -> None:
         """End the nodes that never ended, the innermost first, and the episode."""
@@ -473,9 +493,11 @@ def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map"
 
 
 def ns_of(moment: datetime) -> int:
-    """Return a time of a map file; one without a zone is in UTC."""
+    """Return a time of a map file; one without a zone is in UTC. Raises `CallerError`."""
     aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    return int((aware - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(microseconds=1)) * 1000
+    if (at := (aware - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000) not in TIMES:
+        raise CallerError(f"the time {moment} of the map file must be after 1677 and before 2262")
+    return at
 
 
 def identity_of(path: Path, *further: Path) -> str:

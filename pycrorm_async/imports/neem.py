@@ -72,7 +72,7 @@ class NeemMap(intakes.MapFile, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     types: Mapping[str, str] = {}
-    rate_hz: float = 10.0
+    rate_hz: intakes.Rate = 10.0
     streams: bool = True
     robot_frame: str = ""
 
@@ -298,7 +298,7 @@ def _seconds(value: Any) -> float | None:
     """Return a time in s, also of a text; None for one that says that there is none."""
     try:
         seconds = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     return seconds if math.isfinite(seconds) and 0 < seconds < _NEVER else None
 
@@ -347,8 +347,10 @@ class _Episode:
             self._shift_ns = _hours_between(first.at, begin, last)
         if first is not None:
             begin = min(begin or first.at, first.at + self._shift_ns)
+        begin = self._intake.in_range(begin)
         name = str(meta.get("_id") or "") or intakes.identity_of(*self._files.of("triples"), *self._tf)
-        tags = [each[:100] for each in meta.get("keywords") or () if isinstance(each, str) and each.strip()]
+        keywords = given if isinstance(given := meta.get("keywords"), list) else ()
+        tags = [each[:100] for each in keywords if isinstance(each, str) and each.strip()]
         about = {key: each for key, each in meta.items() if key not in ("_id", "keywords", "created_by") and each}
         if self._shift_ns:
             about["tf_shift_s"] = self._shift_ns / 1e9

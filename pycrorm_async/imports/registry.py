@@ -93,8 +93,12 @@ def import_files(
     settings = read_map_file(map_file, chosen.map_file)
     present: Sequence[Path] = [Path(each) for each in paths]
     for path in present:
-        if not path.exists():
-            raise CallerError(f"{path} does not exist")
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            raise CallerError(f"{path} does not exist") from None
+        except OSError as error:
+            raise CallerError(f"{path} cannot be read: {error.strerror or error}") from None
     intake = Intake(file_format, settings, recording, stored, report_progress)
     for path in present:
         try:

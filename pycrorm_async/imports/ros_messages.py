@@ -85,12 +85,12 @@ class RosMap(intakes.MapFile, frozen=True, kw_only=True, forbid_unknown_fields=T
     objects: Mapping[str, str] = {}
     object_types: Mapping[str, str] = {}
     ignored_frames: tuple[str, ...] = ()
-    rate_hz: float = 10.0
+    rate_hz: intakes.Rate = 10.0
     actions: Mapping[str, str] = {}
     log_level: int = 20
     observations: Mapping[str, str] = {}
-    observation_rate_hz: float = 10.0
-    images: Mapping[str, float] = {}
+    observation_rate_hz: intakes.Rate = 10.0
+    images: Mapping[str, intakes.Rate] = {}
 
 
 class RosReader:

@@ -67,7 +67,7 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[O
     """
     places = _places(spans)
     steps: list[tuple[int, int, int, int, Any]] = []
-    last = max((_end_of(each) for each in spans if each.end is not None), default=0)
+    last = max((each.start if each.end is None else each.end for each in spans), default=0)
     for index, span in enumerate(spans):
         begin, depth = places[span.key]
         steps.append((begin, START, depth, index, span))
@@ -88,7 +88,7 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[O
             span, (at, name, values) = what
             episode.observe(name, values, at, node=span.key)
         else:
-            is_timed, at = what.end is not None, what.end or last
+            is_timed, at = what.end is not None, last if what.end is None else what.end
             episode.end(what.key, what.status, at, failure=what.failure, result=what.result, untimed=not is_timed)
 
 

@@ -116,8 +116,8 @@ def _parsed(path: Path, content: bytes) -> tuple[Mapping[str, Any], int | None]:
     """Return a document with `traceEvents`, or with OTLP's documents as `lines`; and the offset at which it is cut."""
     cut = None
     try:
-        document = msgspec.json.decode(content)
-    except (msgspec.DecodeError, RecursionError):
+        document = _decoded(content)
+    except (ValueError, RecursionError):
         text = content.decode(errors="replace")
         if '"resourceSpans"' not in text[:_BEGIN_CHARACTERS]:
             return _parsed_events(path, text)
@@ -134,13 +134,21 @@ def _parsed(path: Path, content: bytes) -> tuple[Mapping[str, Any], int | None]:
     return {"lines": lines}, cut
 
 
+def _decoded(content: bytes | str) -> Any:
+    """Return a whole document, also with the NaN and the half surrogates that Python writes. Raises `ValueError`."""
+    try:
+        return msgspec.json.decode(content)
+    except msgspec.DecodeError:
+        return json.loads(content)
+
+
 def _parsed_lines(text: str) -> tuple[list[Any], int | None]:
     lines, offset = [], 0
     for line in text.splitlines(keepends=True):
         if line.strip():
             try:
-                lines.append(msgspec.json.decode(line))
-            except (msgspec.DecodeError, RecursionError):
+                lines.append(_decoded(line))
+            except (ValueError, RecursionError):
                 return lines, offset
         offset += len(line.encode())
     return lines, None
@@ -208,7 +216,7 @@ def _zero_ns(
     if settings.start is not None:
         return intakes.ns_of(settings.start)
     times = (each["ts"] for each in events if isinstance(each, dict) and isinstance(each.get("ts"), int | float))
-    if all(int(each) in _EPOCH_US for each in times if each):
+    if all(abs(each) < math.inf and int(each) in _EPOCH_US for each in times if each):
         return 0
     intake.left_out("the date", "the trace has a clock without one: give `start` in the map file")
     return 0
@@ -319,7 +327,7 @@ class _EventReader:
         span.parameters = {**span.parameters, **arguments}
 
     def _at(self, ts: Any) -> int | None:
-        if not isinstance(ts, int | float) or not math.isfinite(ts):
+        if not isinstance(ts, int | float) or not abs(ts) < _TIMES_NS.stop:
             return None
         return _time(self._zero_ns + round(ts * 1000))
 
@@ -403,7 +411,7 @@ def _change(own: Mapping[str, Any]) -> _Give | None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, int | float) and abs(value) < math.inf
 
 
 def _time(value: Any) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import math
 import os
 import random
 import signal
@@ -269,6 +270,10 @@ def test_an_import_that_is_killed_and_started_again_doubles_nothing_and_misses_n
     [
         (["smoke", "t.json"], "there is no format 'smoke'"),
         (["trace", "none.json"], "none.json does not exist"),
+        (["trace", "n" * 300], "cannot be read: File name too long"),
+        (["trace", "t.json", "--map", "late.toml"], "of the map file must be after 1677 and before 2262"),
+        (["neem", "t.json", "--map", "rate.toml"], "Expected `float` >= 1e-06 - at `$.rate_hz`"),
+        (["mcap", "t.json", "--map", "rate.toml"], "Expected `float` >= 1e-06 - at `$.rate_hz`"),
         (["trace", "."], "is a folder: name the trace files in it"),
         (["trace", "words.txt"], "words.txt is no trace in JSON"),
         (["trace", "other.json"], "is no whole trace in JSON: it has neither traceEvents nor resourceSpans"),
@@ -282,9 +287,28 @@ def test_a_wrong_call_or_file_is_one_line_and_leaves_nothing(tmp_path: Path, wor
     (tmp_path / "words.txt").write_text("no trace at all")
     (tmp_path / "other.json").write_text('{"a": [1]}')
     (tmp_path / "wrong.toml").write_text("strat = 3")
+    (tmp_path / "late.toml").write_text("start = 2300-01-01T00:00:00Z")
+    (tmp_path / "rate.toml").write_text("rate_hz = 0.0")
     for option in ([], ["--dry-run"]):
         done = pycrorm("import", *words, *option, "--url", "sqlite:///memory.db", cwd=tmp_path)
         assert done.returncode == 2
         assert line in one_line_of(done)
     rows = ask(tmp_path / "memory.db", "SELECT count(*) FROM event") if (tmp_path / "memory.db").exists() else [(0,)]
     assert rows == [(0,)]
+
+
+def test_a_trace_with_values_that_only_python_writes_is_whole(tmp_path: Path) -> None:
+    spans = [{"ph": "X", "name": "Drive", "cat": "\ud800", "ts": n, "dur": 0, "pid": 1, "tid": 1} for n in range(3)]
+    document = {"traceEvents": [*spans, *({**spans[0], "ts": each} for each in (math.nan, 10**400))]}
+    (tmp_path / "t.json").write_text("\ufeff" + json.dumps(document))
+    report = imported(tmp_path, "trace", tmp_path / "t.json")
+    assert report.cut == []
+    assert [each.nodes for each in report.episodes] == [3]
+    times = ask(tmp_path / "memory.db", "SELECT wall_ns FROM event WHERE type = 'NodeEnded' ORDER BY sequence")
+    assert [ns for (ns,) in times] == [0, 1000, 2000, 2000]  # that of the root is the last
+
+
+def test_the_json_of_a_report_counts_the_statuses(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text(trace_of({"ph": "X", "name": "Drive", "ts": 0, "dur": 5}))
+    done = pycrorm("import", "trace", "t.json", "--json", "--dry-run", "--url", "sqlite:///memory.db", cwd=tmp_path)
+    assert [each["statuses"] for each in json.loads(done.stdout)["episodes"]] == [{"UNKNOWN": 1}]
