@@ -18,6 +18,7 @@ import gzip
 import json
 import math
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -115,7 +116,7 @@ def _stem(file: Path) -> str:
 
 def _is_data(file: Path) -> bool:
     name = file.name.removesuffix(".gz")
-    return name.endswith(_SUFFIXES) and not name.endswith(".metadata.json")
+    return name.endswith(_SUFFIXES) and not name.endswith(".metadata.json") and file.stat().st_size > 0
 
 
 # === documents ================================================================================================
@@ -129,8 +130,7 @@ def documents(path: Path, *, plainly: bool = True) -> _Documents:
     name = path.name.removesuffix(".gz")
     with _opened(path) as file:
         if name.endswith(".bson"):
-            found = _bson_documents(path, file)
-            yield from map(plain, found) if plainly else found
+            yield from _bson_documents(path, file, plainly=plainly)
         else:
             yield from _json_documents(path, file)
 
@@ -146,11 +146,11 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         with gzip.open(raw) as file:
             try:
                 yield file  # type: ignore[misc]
-            except EOFError:
-                raise FileCut("ends in the middle of what is compressed; what stands before is imported") from None
+            except (EOFError, zlib.error, gzip.BadGzipFile):
+                raise FileCut("cannot be decompressed to its end; what stands before is imported") from None
 
 
-def _bson_documents(path: Path, file: IO[bytes]) -> _Documents:
+def _bson_documents(path: Path, file: IO[bytes], *, plainly: bool) -> _Documents:
     try:
         import bson
         from bson.codec_options import CodecOptions, DatetimeConversion
@@ -171,11 +171,13 @@ def _bson_documents(path: Path, file: IO[bytes]) -> _Documents:
         if len(body) < size - 4 or size == 0:
             raise FileCut(f"ends in the middle of document {count + 1:,}; those before are imported")
         try:
-            yield bson.decode(head + body, options)
-        except InvalidBSON as error:
+            document = bson.decode(head + body, options)
+            document = plain(document) if plainly else document
+        except (InvalidBSON, RecursionError, ValueError) as error:
             if count == 0:
                 raise WrongFormat(f"{path} is no file of BSON: {error}") from None
             raise FileCut(f"is damaged at document {count + 1:,}; those before are imported") from None
+        yield document
         count += 1
 
 
@@ -185,18 +187,18 @@ def _json_documents(path: Path, file: IO[bytes]) -> _Documents:
         first = file.readline(_LINES_MAX)
     document = _line(first)
     if isinstance(document, dict) and not {"@graph", "@context", "@id"} & document.keys():
-        yield plain(document)
+        yield document
         yield from _json_lines(file)
         return
     text = (first + file.read()).decode(errors="replace")
     try:
-        whole, cut = json.loads(text), False
+        whole, cut = plain(json.loads(text)), False
     except (ValueError, RecursionError):
         whole, cut = _whole_items(path, text), True
     if isinstance(whole, dict) and not {"@graph", "@context", "@id"} & whole.keys():
-        yield plain(whole)
+        yield whole
     elif isinstance(whole, list) and not any(isinstance(each, dict) and "@id" in each for each in whole):
-        yield from (plain(each) for each in whole if isinstance(each, dict))
+        yield from (each for each in whole if isinstance(each, dict))
     else:
         yield from json_ld(whole)
     if cut:
@@ -211,13 +213,13 @@ def _json_lines(file: IO[bytes]) -> _Documents:
         document = _line(line)
         if not isinstance(document, dict):
             raise FileCut(f"ends in the middle of document {count + 1:,}; those before are imported")
-        yield plain(document)
+        yield document
         count += 1
 
 
 def _line(line: bytes) -> Any:
     try:
-        return json.loads(line)
+        return plain(json.loads(line))
     except (ValueError, RecursionError):
         return None
 
@@ -228,9 +230,9 @@ def _whole_items(path: Path, text: str) -> list[Any]:
     while position:
         try:
             item, position = decoder.raw_decode(text, re.compile(r"[\s,]*").match(text, position).end())  # type: ignore[union-attr]
+            items.append(plain(item))
         except (ValueError, RecursionError):
             break
-        items.append(item)
     if not items:
         raise WrongFormat(f"{path} is no NEEM in JSON")
     return items
@@ -261,10 +263,13 @@ def _extended(key: str, inner: Any) -> Any:
         if isinstance(inner, str):
             return _milliseconds(inner)
         return plain(inner)
-    if key in ("$numberDecimal", "$numberDouble"):
-        return float(Decimal(str(inner))) if key == "$numberDecimal" else float(inner)
-    if key in ("$numberLong", "$numberInt"):
-        return int(inner)
+    try:
+        if key in ("$numberDecimal", "$numberDouble"):
+            return float(Decimal(str(inner)))
+        if key in ("$numberLong", "$numberInt"):
+            return int(inner)
+    except (ArithmeticError, TypeError, ValueError):
+        return str(inner)
     return str(inner) if not isinstance(inner, Mapping) else plain(dict(inner))
 
 

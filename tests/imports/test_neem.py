@@ -195,3 +195,42 @@ def test_the_questions_of_the_page_have_answers(
     answers = capsys.readouterr().out
     for each in ("GripAction", "ManipulationPoseUnreachable", "Breakfast", "tf base_footprint camera", "Accessing"):
         assert each in answers
+
+
+def test_numbers_of_mongodb_times_and_metadata_of_any_kind_end_no_import(tmp_path: Path) -> None:
+    rows = neems.statements()
+    strange = ({"$numberDecimal": "abc"}, {"$numberLong": "x"}, {"$numberInt": None}, 10**400, 9e15)
+    for index, value in enumerate(strange):
+        rows += neems.action(f"Action_STRANGE{index}", "Stirring", BEGIN_S, value)
+    (tmp_path / "neem").mkdir()
+    lines = "".join(f"{json.dumps(each)}\n" for each in rows)
+    (tmp_path / "neem/triples.json").write_text(lines + '{"o": ' + "[" * 600 + "]" * 600 + "}")
+    (tmp_path / "neem/annotations.json").write_bytes(b"")  # what mongoexport writes of an empty collection
+    (tmp_path / "neem/meta.json").write_text(json.dumps({"_id": "\ud800", "keywords": 5}))
+    report = imported(tmp_path, "neem", tmp_path / "neem")
+    assert_verified(tmp_path)
+    assert [each.nodes for each in report.episodes] == [12]
+    assert report.left_out["times", "they are before 1677 or after 2262; the nearest moment takes their place"] == 2
+    assert len(report.cut) == 1
+
+
+def test_a_failed_action_of_a_neem_in_which_nothing_ended_ends_with_the_last_start(tmp_path: Path) -> None:
+    rows = [each | {"o": "Infinity"} if each["p"].endswith("End") else each for each in neems.statements()]
+    (tmp_path / "triples.json").write_text("".join(f"{json.dumps(each)}\n" for each in rows))
+    imported(tmp_path, "neem", tmp_path / "triples.json")
+    [[ended]] = ask(
+        tmp_path / "memory.db", "SELECT min(wall_ns) FROM event WHERE type IN ('NodeEnded', 'EpisodeEnded')"
+    )
+    assert ended == round((BEGIN_S + 7) * 1000) * 1_000_000
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:-9], lambda content: content[:60] + b"\xff" * 60])
+def test_a_compressed_file_that_is_damaged_is_one_line_of_the_report(tmp_path: Path, damage: Any) -> None:
+    neem = neems.neem_folder(tmp_path / "neem")
+    file = neem / "annotations/roslog/annotations.bson"
+    noise = json.dumps([str(each**7) for each in range(500)])
+    neems.bson_file(file, [{"s": f"{SOMA}Milk", "p": "comment", "v": noise}])
+    file.with_name("annotations.bson.gz").write_bytes(damage(gzip.compress(file.read_bytes())))
+    file.unlink()
+    report = imported(tmp_path, "neem", neem)
+    assert [len(report.cut), shown(tmp_path / "memory.db")] == [1, TREE]
