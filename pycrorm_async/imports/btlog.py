@@ -111,7 +111,11 @@ def _read_sessions(path: Path, intake: Intake) -> None:
 
         def transitions(session: int) -> Iterator[tuple[int, int, int]]:
             try:
-                yield from database.execute(select, (session,))
+                for row in database.execute(select, (session,)):
+                    if all(isinstance(each, int) for each in row):
+                        yield row
+                    else:
+                        intake.left_out("transitions", "their time, node or status is no whole number")
             except sqlite3.DatabaseError as error:
                 intake.cut(path, f"cannot be read to its end: {error}")
 
@@ -121,7 +125,7 @@ def _read_sessions(path: Path, intake: Intake) -> None:
             if first is None:
                 intake.left_out("sessions", "they have no transitions")
             else:
-                _give(path, f"{identity}-{session}", _nodes_of(path, xml), first[0], chain([first], rows), intake)
+                _give(path, f"{identity}-{session}", _nodes_of(path, str(xml)), first[0], chain([first], rows), intake)
 
 
 def _nodes_of(path: Path, xml: str) -> dict[int, _TreeNode]:

@@ -19,11 +19,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
 from pycrorm_async.imports.spans import Span, give_spans
@@ -39,7 +40,8 @@ _VIDEOS = ("video", "image")
 _PLAN_COLUMNS = frozenset(
     "episode_index node parent kind dtype parameters status reason message dataset_from_index dataset_to_index".split()
 )
-_FPS_MAX = 1e6
+_FPS_MIN, _FPS_MAX = 1e-3, 1e6
+_LENGTH_MAX = 2**53
 _TRAVERSAL = re.compile(r"{[^}:]*[.\[]")
 """Finds an attribute or an item in a template, which those of LeRobot do not have."""
 _BATCH = 10_000
@@ -56,7 +58,7 @@ class LeRobotMap(intakes.MapFile, frozen=True, kw_only=True, forbid_unknown_fiel
     """
 
     start: datetime | None = None
-    pause_s: float = 60.0
+    pause_s: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 60.0
     subtask: str = "Subtask"
 
 
@@ -68,7 +70,7 @@ class _Info(msgspec.Struct):
     features: dict[str, dict[str, Any]]
     data_path: str
     robot_type: str | None = None
-    chunks_size: int = 1000
+    chunks_size: Annotated[int, msgspec.Meta(gt=0)] = 1000
 
 
 class _Row(NamedTuple):
@@ -95,6 +97,8 @@ def read_lerobot(path: Path, settings: LeRobotMap, intake: Intake) -> None:
     for row in rows:
         intake.progress(row.number, len(rows))
         end = begin + round(row.length / dataset.info.fps * _SECOND_NS)
+        if end not in intakes.TIMES:
+            raise CallerError(f"episode {row.number} would end after 2262: `start` or `pause_s` is too large")
         try:
             _give(dataset, row, begin, end, settings, intake)
         except _Unreadable as error:
@@ -122,7 +126,7 @@ class _DataSet:
             raise intakes.WrongFormat(f"{path} is no LeRobot data set: it has no meta/info.json") from None
         except msgspec.DecodeError as error:
             raise intakes.WrongFormat(f"{file} is not that of a LeRobot data set: {error}") from None
-        if not 0 < self.info.fps < _FPS_MAX or _TRAVERSAL.search(self.info.data_path):
+        if not _FPS_MIN <= self.info.fps < _FPS_MAX or _TRAVERSAL.search(self.info.data_path):
             raise intakes.WrongFormat(f"{file} is not that of a LeRobot data set: its fps or its data_path cannot be")
         self.is_v3 = self.info.codebase_version.startswith("v3")
         if not self.is_v3 and self.info.codebase_version not in ("v2.0", "v2.1"):
@@ -145,9 +149,12 @@ class _DataSet:
                 }
                 file = self.path / self.info.data_path.format(**places)
                 tasks = [str(each) for each in raw.get("tasks") or ()]
-            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-                raise intakes.WrongFormat(f"{self.path} describes its episodes otherwise: {error}") from None
-            if self.path.resolve() not in file.resolve().parents:
+                if length > _LENGTH_MAX:
+                    raise ValueError(f"an episode of {length:.0e} frames")  # noqa: TRY301
+                is_inside = self.path.resolve() in file.resolve().parents
+            except (LookupError, TypeError, ValueError, AttributeError, MemoryError, ArithmeticError) as error:
+                raise intakes.WrongFormat(f"{self.path} describes its episodes otherwise: {error!r:.200}") from None
+            if not is_inside:
                 raise intakes.WrongFormat(f"{self.path} names data outside of its folder")
             success = raw.get("success")
             yield _Row(index, tasks, length, file, success)

@@ -81,6 +81,8 @@ def read_pycram_orm(path: Path, settings: OrmMap, intake: Intake) -> None:
                 raise intakes.WrongFormat(f"{path} is no database of PyCRAM's ORM: it has no table {missing}")
             for row in database.execute('SELECT * FROM "ProcessMetaData" ORDER BY id').fetchall():
                 _Episode(database, tables, dict(row), zone, intake).give(path)
+    except KeyError as error:
+        raise intakes.WrongFormat(f"{path} is no database of PyCRAM's ORM: it has no column {error}") from None
     except sqlite3.Error as error:
         raise intakes.WrongFormat(f"{path} cannot be read as a database of SQLite: {error}") from None
 
@@ -118,11 +120,12 @@ class _Episode:
             episode.ended(tops.pop() if len(tops) == 1 else "UNKNOWN", max(each.end or each.start for each in spans))
 
     def _spans(self) -> Iterator[Span]:
-        nodes = self._database.execute(
+        rows = self._database.execute(
             'SELECT node.*, d.dtype AS designator FROM "TaskTreeNode" AS node'
             ' LEFT JOIN "Designator" AS d ON d.id = node.action_id WHERE node.process_metadata_id = ? ORDER BY node.id',
             (self._row["id"],),
-        ).fetchall()
+        )
+        nodes: list[dict[str, Any]] = [dict(each) for each in rows]
         parents = {each["id"]: each["parent_id"] for each in nodes if each["action_id"] is None}
         for count, node in enumerate(nodes):
             if count % _PROGRESS_NODES == 0:
@@ -191,7 +194,12 @@ class _Episode:
         if pose is None or position is None or turn is None:
             return None
         numbers = [position[each] for each in "xyz"], [turn[each] for each in "xyzw"]
-        return intakes.pose_at(*numbers, self._ns(pose["time"]) or 0, str(pose["frame"] or "map"))
+        at, frame = self._ns(pose["time"]) or 0, str(pose["frame"] or "map")
+        try:
+            return intakes.pose_at(*numbers, at, frame)
+        except (TypeError, ValueError):
+            self._intake.left_out("poses", "a coordinate is no number")
+            return None
 
     def _object(self, id_: Any) -> ObjectValue | None:
         row = self._one("Object", id_)
@@ -207,4 +215,5 @@ class _Episode:
         pose = self._pose(state["pose_id"]) if state is not None else None
         if state is None or pose is None:
             return None
-        return RobotValue(pose, str(state["type"] or "ROBOT"), state["torso_height"])
+        height = state["torso_height"]
+        return RobotValue(pose, str(state["type"] or "ROBOT"), height if isinstance(height, int | float) else None)

@@ -140,3 +140,16 @@ def test_a_wrong_or_cut_log_is_one_line(tmp_path: Path, content: bytes, line: st
     done = pycrorm("import", "btlog", "run.btlog", "--dry-run", cwd=tmp_path)
     assert done.returncode == code
     assert line in one_line_of(done)
+
+
+def test_rows_of_other_values_and_times_out_of_range_end_no_import(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "log.db3")) as database, database:
+        database.execute("CREATE TABLE Definitions (session_id, xml_tree)")
+        database.execute("CREATE TABLE Transitions (timestamp, session_id, node_uid, state)")
+        database.execute("INSERT INTO Definitions VALUES (1, ?)", (XML,))
+        rows = [(0, 1, RUNNING), (1.5, 1, RUNNING), (2**62, 1, SUCCESS), ("x", 1, RUNNING), (b"y", 1, RUNNING)]
+        database.executemany("INSERT INTO Transitions VALUES (?, 1, ?, ?)", [*rows, (None, 1, RUNNING)])
+    report = imported(tmp_path, "btlog", tmp_path / "log.db3")
+    assert [(each.nodes, each.statuses) for each in report.episodes] == [(1, {"SUCCEEDED": 1})]
+    assert report.left_out["transitions", "their time, node or status is no whole number"] == 4
+    assert sum(report.left_out.values()) == 5  # and the time behind 2262

@@ -120,3 +120,17 @@ def test_what_is_no_such_database_is_refused_in_one_line(tmp_path: Path) -> None
     ):
         with pytest.raises(CallerError, match=reason):
             import_files("pycrorm", [path], None, map_file=map_file)
+
+
+def test_values_of_other_types_are_left_out_and_another_schema_is_one_line(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(orm_database(tmp_path / "orm.db"))) as database, database:
+        database.execute("UPDATE RobotState SET torso_height = 'high'")
+        database.execute("UPDATE Position SET x = 'left' WHERE id = (SELECT max(id) FROM Position)")
+        database.execute("UPDATE TaskTreeNode SET end_time = '2300-01-01 00:00:00'")
+    report = imported(tmp_path, "pycrorm", tmp_path / "orm.db")
+    assert [each.nodes for each in report.episodes] == [5]
+    assert report.left_out["poses", "a coordinate is no number"] > 0
+    with closing(sqlite3.connect(tmp_path / "orm.db")) as database, database:
+        database.execute("ALTER TABLE TaskTreeNode RENAME COLUMN status TO state")
+    with pytest.raises(CallerError, match="it has no column 'status'"):
+        import_files("pycrorm", [tmp_path / "orm.db"], None)
