@@ -285,7 +285,6 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
     "README.md": {
         "A plan of your own": the_plan_greets_and_is_recorded,
         "Ask it": the_queries_have_answers,
-        "Your own executive": the_executive_is_recorded,
     },
     "pycrorm_async/events/README.md": {
         "Events as they happen": events_are_followed_until_the_memory_is_closed,
@@ -333,6 +332,7 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
         'Recall: "have I been here before, and how did it end?"': past_actions_are_recalled,
     },
     "pycrorm_async/record/README.md": {
+        "Recording another executive": the_executive_is_recorded,
         "Executives that tick, and executives with run ids": the_states_that_ticked_are_counted,
         "Testing an integration": the_test_of_the_integration_passes,
     },
@@ -376,7 +376,6 @@ def test_a_reader_can_follow_the_page_from_top_to_bottom(
 #
 # `test_pages.py` follows the pages, and runs what is on them.
 
-README = PAGES["README.md"]
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
 
@@ -432,8 +431,8 @@ def test_every_block_of_python_compiles_and_every_command_of_a_block_has_its_ver
 
 
 @pytest.mark.slow
-def test_the_readme_names_every_verb_and_no_other(tmp_path: Path) -> None:
-    lines = re.findall(r"^pycrorm ([\w|-]+)", README, re.MULTILINE)
+def test_the_page_of_the_command_names_every_verb_and_no_other(tmp_path: Path) -> None:
+    lines = re.findall(r"^pycrorm ([\w|-]+)", PAGES["pycrorm_async/cli/README.md"], re.MULTILINE)
     verbs = {verb for line in lines for verb in line.split("|")}
     command = typer.main.get_command(app())
     assert isinstance(command, TyperGroup)
