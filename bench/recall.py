@@ -32,7 +32,7 @@ from typing import Any
 from bench.material.actions import BLOCK_CASES, CUES, Actions
 from bench.reporting.figures import MISSING, console, percentiles, spread
 from pycrorm_async.recall.answer import Sequences, answer
-from pycrorm_async.recall.blocks import Block, CaseLibrary, decode, encode, merge
+from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, decode, encode, merge
 from pycrorm_async.recall.search import Cue, forgotten
 
 # === soar memory ==============================================================================================
@@ -188,7 +188,7 @@ def _stored(library: CaseLibrary) -> dict[str, float]:
     """Return the CPU time of making small blocks of cases, and of merging 16 of them into one."""
     cases = list(library.blocks[0].cases())[: 16 * _FLUSHED]
     began_s = time.process_time()
-    blocks = [Block.of(cases[first : first + _FLUSHED]) for first in range(0, len(cases), _FLUSHED)]
+    blocks = [CaseBlock.of(cases[first : first + _FLUSHED]) for first in range(0, len(cases), _FLUSHED)]
     encoded = [encode(block) for block in blocks]
     flushed_s = time.process_time()
     encode(merge([decode(each) for each in encoded]))

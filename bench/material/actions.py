@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall.blocks import Block, Group
+from pycrorm_async.recall.blocks import CaseBlock, Group
 from pycrorm_async.recall.columns import Column, Words
 from pycrorm_async.recall.search import Cue, Wanted
 
@@ -56,13 +56,13 @@ class Actions:
         seen = sizes[self.texts["object_type"]]
         return np.flatnonzero(seen <= max(60, int(sizes[sizes > 0].min())))
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[CaseBlock]:
         """Yield the actions as blocks."""
         for first in range(0, len(self), BLOCK_CASES):
             rows = np.arange(first, min(len(self), first + BLOCK_CASES))[::-1]
             yield self._block(rows[np.argsort(self.types[rows], kind="stable")])
 
-    def _block(self, rows: NDArray[np.int64]) -> Block:
+    def _block(self, rows: NDArray[np.int64]) -> CaseBlock:
         columns = {name: self._column(name, codes[rows]) for name, codes in self.texts.items()}
         columns["status"] = Column(self.succeeded[rows].astype(np.uint8) + 1, Words(("FAILED", "SUCCEEDED")))
         values = {name: Column(each[rows]) for name, each in self.numbers.items()}
@@ -71,7 +71,7 @@ class Actions:
         whole = Group("", nodes, rows * 1_000_000, np.zeros(rows.size, np.int32), columns, values)
         types = self.types[rows]
         names = {number: f"Type{number:02}Action" for number in np.unique(types).tolist()}
-        return Block({name: replace(whole.taken(types == each), type=name) for each, name in names.items()})
+        return CaseBlock({name: replace(whole.taken(types == each), type=name) for each, name in names.items()})
 
     def _column(self, name: str, codes: NDArray[np.int16]) -> Column:
         words = Words(f"{name.upper()}_{code}" for code in range(_TEXTS[name][0]))

@@ -21,7 +21,7 @@ from pycrorm_async.events.codec import description_of
 from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.replay import EpisodeReplay, EventTime, ReplayedNode
+from pycrorm_async.query.replay import EpisodeReplay, ReplayedNode, ReplayTime
 from pycrorm_async.query.scene import assumed_model, joint_pose, link_poses, object_model, point_model
 from pycrorm_async.query.text import parameters_text
 from pycrorm_async.store.address import DatabaseAddress
@@ -39,7 +39,7 @@ BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw"
 class Change(NamedTuple):
     """A change of an object of the world: its new pose (position, orientation), new joint positions, or its removal."""
 
-    when: EventTime
+    when: ReplayTime
     object: int
     pose: tuple[float, ...] | None
     joints: Mapping[str, float]
@@ -54,7 +54,7 @@ class Change(NamedTuple):
 class PlanLine(NamedTuple):
     """The start or the end of a node as text. `label` is its type with the names of its objects."""
 
-    when: EventTime
+    when: ReplayTime
     label: str
     text: str
     is_failure: bool = False
@@ -70,7 +70,7 @@ class ExportedEpisode(EpisodeReplay):
 
     def __init__(self, row: EpisodeRow, address: DatabaseAddress) -> None:
         super().__init__(row, address, strict=False, samples=True)
-        self.events: list[EventTime] = []
+        self.events: list[ReplayTime] = []
         self.changes: list[Change] = []
         self._poses: dict[int, tuple[float, ...]] = {}
 
@@ -202,7 +202,7 @@ class Frames(NamedTuple):
     robot: str
     channels: tuple[str, ...]
     states: NDArray[np.float32]
-    at: list[EventTime]
+    at: list[ReplayTime]
     subtasks: list[str]
 
 
@@ -232,7 +232,7 @@ def frames_of(episode: ExportedEpisode, clock: Clock, fps: int) -> Frames:
 
 def _states(
     episode: ExportedEpisode, identity: int, channels: Sequence[str]
-) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
+) -> Iterator[tuple[ReplayTime, tuple[float, ...]]]:
     """Yield each event that changed the robot's state, and the state after it."""
     index = {name: position for position, name in enumerate(channels)}
     state = [0.0] * len(channels)
@@ -253,7 +253,7 @@ def _states(
             yield change.when, now
 
 
-def _events_with(episode: ExportedEpisode, identity: int) -> list[EventTime]:
+def _events_with(episode: ExportedEpisode, identity: int) -> list[ReplayTime]:
     """Return the events from the one that added the robot to the last one before its removal."""
     removals = (each.when.sequence for each in episode.changes if each.removed and each.object == identity)
     removal = next(removals, None)
@@ -261,8 +261,8 @@ def _events_with(episode: ExportedEpisode, identity: int) -> list[EventTime]:
 
 
 def _resampled(
-    episode: int, events: Sequence[EventTime], changed: Sequence[tuple[EventTime, tuple[float, ...]]], fps: int
-) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
+    episode: int, events: Sequence[ReplayTime], changed: Sequence[tuple[ReplayTime, tuple[float, ...]]], fps: int
+) -> Iterator[tuple[ReplayTime, tuple[float, ...]]]:
     """Yield the last event and the state in force at each multiple of 1 / fps, from the first event to the last."""
     begin_ns, end_ns = events[0].since_ns, events[-1].since_ns
     count = (end_ns - begin_ns) * fps // _SECOND_NS + 1
@@ -278,10 +278,10 @@ def _resampled(
         yield events[event]._replace(since_ns=since_ns), changed[state][1]
 
 
-def _subtasks(episode: ExportedEpisode, at: Sequence[EventTime]) -> Iterator[str]:
+def _subtasks(episode: ExportedEpisode, at: Sequence[ReplayTime]) -> Iterator[str]:
     """Yield the label of the action that was running last at each of these events."""
     actions = [(each.start.sequence, each) for each in episode.nodes.values() if each.kind == "action"]
-    running: list[tuple[int, str, EventTime | None]] = []  # the one that started last comes first
+    running: list[tuple[int, str, ReplayTime | None]] = []  # the one that started last comes first
     started = 0
     for when in at:
         while started < len(actions) and actions[started][0] <= when.sequence:
@@ -303,9 +303,9 @@ def _subtasks(episode: ExportedEpisode, at: Sequence[EventTime]) -> Iterator[str
 # or, by event, `fps` events in a second; its sequence is that of the event.
 
 _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
-_Message: TypeAlias = tuple[EventTime, str, Any]
+_Message: TypeAlias = tuple[ReplayTime, str, Any]
 """The event of a message, its topic and its content. Those of one topic come in the order of the events."""
-_Stamp: TypeAlias = Callable[[EventTime], Any]
+_Stamp: TypeAlias = Callable[[ReplayTime], Any]
 """Makes the time stamp of a message of an event."""
 
 
@@ -326,11 +326,11 @@ def write_mcap(
     except ImportError:
         raise MissingExtra("MCAP files need mcap and foxglove-sdk: pip install 'pycrorm-async[mcap]'") from None
 
-    def time_ns(when: EventTime) -> int:
+    def time_ns(when: ReplayTime) -> int:
         by_event_ns = when.sequence * _SECOND_NS // options["fps"]
         return episode.begin_wall_ns + (when.since_ns if options["clock"] == "time" else by_event_ns)
 
-    def stamp(when: EventTime) -> Any:
+    def stamp(when: ReplayTime) -> Any:
         seconds, rest_ns = divmod(time_ns(when), _SECOND_NS)
         return messages.Timestamp(sec=seconds, nsec=rest_ns)
 
@@ -503,7 +503,7 @@ def _part(frame: str) -> str:
     return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
 
 
-def _indexes(rr: Any, whens: Sequence[EventTime]) -> list[Any]:
+def _indexes(rr: Any, whens: Sequence[ReplayTime]) -> list[Any]:
     return [
         rr.TimeColumn("event", sequence=[each.sequence for each in whens]),
         rr.TimeColumn("time", duration=[each.since_ns / 1e9 for each in whens]),
@@ -580,7 +580,7 @@ _GREY = (0.6, 0.6, 0.6, 1.0)
 class FrameChange(NamedTuple):
     """A frame has a new pose in its parent: translation (m) and quaternion xyzw."""
 
-    when: EventTime
+    when: ReplayTime
     parent: str
     child: str
     translation: tuple[float, float, float]

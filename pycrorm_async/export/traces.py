@@ -25,7 +25,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Happening, NodeEnded, ObjectMoved, Observed
 from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.scenes import ExportedEpisode, read_episode_as
-from pycrorm_async.query.replay import EventTime, ReplayedNode
+from pycrorm_async.query.replay import ReplayedNode, ReplayTime
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.writer.drain import run_to_completion
@@ -44,7 +44,7 @@ class TracedEpisode(ExportedEpisode):
     def __init__(self, row: EpisodeRow, address: DatabaseAddress) -> None:
         super().__init__(row, address)
         self.results: dict[int, Any] = {}
-        self.observations: list[tuple[EventTime, Observed]] = []
+        self.observations: list[tuple[ReplayTime, Observed]] = []
         self.frames: dict[int, str] = {}
 
     def read(self, event: StoredEvent) -> Happening | None:
@@ -173,7 +173,7 @@ def _object_events(episode: TracedEpisode) -> Iterator[dict[str, Any]]:
         yield {"ph": "i", "s": "p", "name": name, "ts": _us(change.when), "pid": 1, "tid": 0, "args": {OWN: own}}
 
 
-def _us(when: EventTime) -> float:
+def _us(when: ReplayTime) -> float:
     return when.since_ns / 1000
 
 
@@ -234,11 +234,11 @@ def _span(episode: TracedEpisode, sequence: int, node: ReplayedNode) -> dict[str
     return span
 
 
-def _event(episode: TracedEpisode, when: EventTime, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def _event(episode: TracedEpisode, when: ReplayTime, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     return {"timeUnixNano": _wall(episode, when), "name": name, "attributes": _attributes(values)}
 
 
-def _wall(episode: TracedEpisode, when: EventTime) -> str:
+def _wall(episode: TracedEpisode, when: ReplayTime) -> str:
     """Return a wall time as JSON has it: numbers of 64 bits are texts."""
     return str(episode.begin_wall_ns + when.since_ns)
 

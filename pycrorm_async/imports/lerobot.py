@@ -27,7 +27,7 @@ import numpy as np
 from pycrorm_async.errors import CallerError
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
-from pycrorm_async.imports.spans import Span, give_spans
+from pycrorm_async.imports.spans import NodeSpan, give_spans
 from pycrorm_async.query.frames import needed_pyarrow
 
 _SECOND_NS = 10**9
@@ -305,7 +305,7 @@ def _subtask_spans(
     at: np.ndarray[Any, Any],
     end: int,
     settings: LeRobotMap,
-) -> list[Span]:
+) -> list[NodeSpan]:
     """Return a node for each run of frames with one subtask."""
     indices = columns.get("subtask_index")
     if indices is None or not len(indices):
@@ -315,11 +315,11 @@ def _subtask_spans(
     for number, (first, behind) in enumerate(pairwise(borders)):
         stop = int(at[behind]) if behind < len(at) else end
         name = dataset.subtasks.get(int(indices.ravel()[first]), str(indices.ravel()[first]))
-        spans.append(Span(number, settings.subtask, {"name": name}, int(at[first]), stop))
+        spans.append(NodeSpan(number, settings.subtask, {"name": name}, int(at[first]), stop))
     return spans
 
 
-def _plan_spans(nodes: Sequence[Mapping[str, Any]], at: np.ndarray[Any, Any], end: int) -> list[Span]:
+def _plan_spans(nodes: Sequence[Mapping[str, Any]], at: np.ndarray[Any, Any], end: int) -> list[NodeSpan]:
     """Return the nodes of an export of ours; each starts and ends with a frame."""
     first = min(int(each["dataset_from_index"]) for each in nodes)
 
@@ -334,7 +334,7 @@ def _plan_spans(nodes: Sequence[Mapping[str, Any]], at: np.ndarray[Any, Any], en
         failure = (str(each["reason"]), str(each["message"] or "")) if each.get("reason") else None
         begin = time_of(each["dataset_from_index"])
         spans.append(
-            Span(
+            NodeSpan(
                 each["node"],
                 str(each["dtype"]),
                 {"parameters": each["parameters"]} if each.get("parameters") else {},

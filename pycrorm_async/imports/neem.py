@@ -39,8 +39,8 @@ from pycrorm_async.export import neem_vocabulary as vocabulary
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
 from pycrorm_async.imports.neem_files import FileCut, NeemFiles, Transform, documents, neems_in, transforms, triples
-from pycrorm_async.imports.spans import Other, Span, give_spans
-from pycrorm_async.record.frames import Frames
+from pycrorm_async.imports.spans import NodeSpan, Other, give_spans
+from pycrorm_async.record.frames import FramePlaces
 from pycrorm_async.world.pose import ObjectType
 
 _CHANNELS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -375,7 +375,7 @@ class _Episode:
 
     # --- actions ----------------------------------------------------------------------------------------------
 
-    def _make_spans(self) -> list[Span]:
+    def _make_spans(self) -> list[NodeSpan]:
         facts = self._facts
         intervals = {each: facts.interval(each) for each in self._own.actions}
         known = [begin for begin, _ in intervals.values() if begin is not None and begin > _RELATIVE]
@@ -400,7 +400,7 @@ class _Episode:
             task_class = facts.class_of(task if task is not None else action)
             class_name = vocabulary.local(task_class)
             dtype = self._settings.types.get(class_name) or vocabulary.DTYPES.get(class_name, class_name)
-            span = Span(action, dtype, {}, _ns(start), None if end is None else _ns(max(end, start)))
+            span = NodeSpan(action, dtype, {}, _ns(start), None if end is None else _ns(max(end, start)))
             span.late = partial(self._parameters, action, task, task_class, dtype)
             span.parent = above if above in self._members else None
             span.status, span.failure = status, failure
@@ -410,10 +410,10 @@ class _Episode:
             spans.append(span)
         return spans
 
-    def _own_span(self, action: str, own: Mapping[str, Any]) -> Span:
+    def _own_span(self, action: str, own: Mapping[str, Any]) -> NodeSpan:
         """Return the node that our export wrote."""
         above = self._facts.parents.get(action)
-        span = Span(action, str(own["dtype"]), {}, own["start_ns"], own["end_ns"])
+        span = NodeSpan(action, str(own["dtype"]), {}, own["start_ns"], own["end_ns"])
         span.parent = above if above in self._members else None
         span.kind = own["kind"]
         span.status = own["status"] if own["status"] in get_args(NodeStatus) else "UNKNOWN"
@@ -549,7 +549,7 @@ class _ObjectFrames:
     """The frames of tf that are those of objects, and where all frames are."""
 
     def __init__(self, objects: Iterable[str], robots: Iterable[str], robot_frame: str) -> None:
-        self._frames = Frames()
+        self._frames = FramePlaces()
         self._of: dict[str, str] = {vocabulary.local(each): each for each in objects}
         self._robots = list(robots)
         self._robot_frames = (robot_frame,) if robot_frame else _ROBOT_FRAMES

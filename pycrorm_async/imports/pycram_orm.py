@@ -33,7 +33,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import NodeStatus, ObjectValue, PoseValue, RobotValue
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
-from pycrorm_async.imports.spans import Span, give_spans
+from pycrorm_async.imports.spans import NodeSpan, give_spans
 from pycrorm_async.record.plan_types import built_in_declaration
 
 _NEEDED: Final = frozenset(
@@ -119,7 +119,7 @@ class _Episode:
             tops = {each.status for each in spans if each.parent is None}
             episode.ended(tops.pop() if len(tops) == 1 else "UNKNOWN", max(each.end or each.start for each in spans))
 
-    def _spans(self) -> Iterator[Span]:
+    def _spans(self) -> Iterator[NodeSpan]:
         rows = self._database.execute(
             'SELECT node.*, d.dtype AS designator FROM "TaskTreeNode" AS node'
             ' LEFT JOIN "Designator" AS d ON d.id = node.action_id WHERE node.process_metadata_id = ? ORDER BY node.id',
@@ -141,7 +141,7 @@ class _Episode:
             parent = node["parent_id"]
             for _ in range(len(parents) + 1):  # above nodes without a designator
                 parent = parents.get(parent, parent)
-            span = Span(node["id"], dtype, {}, start, None if end is None else max(end, start), parent)
+            span = NodeSpan(node["id"], dtype, {}, start, None if end is None else max(end, start), parent)
             span.kind = "motion" if self._has("Motion", node["action_id"]) else "action"
             span.status = _STATUSES.get(str(node["status"]), "UNKNOWN")
             if node["reason"]:

@@ -1,4 +1,4 @@
-"""A `Span` is a node with its interval; `give_spans` gives a tree of them to an episode in the order of time."""
+"""A `NodeSpan` is a node with its interval; `give_spans` gives a tree of them to an episode in the order of time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Other: TypeAlias = tuple[int, Callable[[int], object]]
 
 
 @dataclass(slots=True)
-class Span:
+class NodeSpan:
     """A node of a file that says when it began and ended.
 
     Attributes:
@@ -46,9 +46,9 @@ class Span:
     robot: RobotValue | None = None
 
 
-def nest(spans: Iterable[Span]) -> None:
+def nest(spans: Iterable[NodeSpan]) -> None:
     """Give each span the innermost one that is open when it starts as its parent, as on one track of a trace."""
-    stack: list[Span] = []
+    stack: list[NodeSpan] = []
     for span in sorted(spans, key=lambda each: (each.start, -_end_of(each))):
         while stack and _end_of(stack[-1]) <= span.start:
             stack.pop()
@@ -56,11 +56,11 @@ def nest(spans: Iterable[Span]) -> None:
         stack.append(span)
 
 
-def _end_of(span: Span) -> int:
+def _end_of(span: NodeSpan) -> int:
     return 2**63 if span.end is None else span.end
 
 
-def give_spans(episode: IntakeEpisode, spans: Sequence[Span], others: Iterable[Other] = ()) -> None:
+def give_spans(episode: IntakeEpisode, spans: Sequence[NodeSpan], others: Iterable[Other] = ()) -> None:
     """Give a tree of spans to an episode, and what else happened, which must be in the order of time.
 
     A span whose clock was behind that of its parent starts after it, at its own time.
@@ -96,7 +96,7 @@ def _order(step: tuple[int, int, int, int, Any]) -> tuple[int, int, int, int]:
     return step[:4]
 
 
-def _places(spans: Sequence[Span]) -> dict[Hashable, tuple[int, int]]:
+def _places(spans: Sequence[NodeSpan]) -> dict[Hashable, tuple[int, int]]:
     """Return by key when each span starts, at the earliest with its parent, and how deep it is.
 
     A span that is its own ancestor loses its parent.
@@ -104,8 +104,8 @@ def _places(spans: Sequence[Span]) -> dict[Hashable, tuple[int, int]]:
     by_key = {each.key: each for each in spans}
     places: dict[Hashable, tuple[int, int]] = {}
     for span in spans:
-        path: dict[Hashable, Span] = {}
-        above: Span | None = span
+        path: dict[Hashable, NodeSpan] = {}
+        above: NodeSpan | None = span
         while above is not None and above.key not in places:
             if above.key in path:
                 next(reversed(path.values())).parent = None

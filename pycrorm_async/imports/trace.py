@@ -36,7 +36,7 @@ from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.export.traces import OWN
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
-from pycrorm_async.imports.spans import Span, give_spans, nest
+from pycrorm_async.imports.spans import NodeSpan, give_spans, nest
 
 _OWN = f"{OWN}."
 _NAMES_MAX, _NAME_MAX = 100, 200
@@ -234,9 +234,9 @@ class _EventReader:
         self.others: list[tuple[int, _Give]] = []
         self.names: set[str] = set()
         self._intake, self._settings, self._zero_ns = intake, settings, zero_ns
-        self._tracks: dict[Hashable, list[Span]] = defaultdict(list)
-        self._open: dict[Hashable, list[Span]] = defaultdict(list)
-        self._own: list[Span] = []
+        self._tracks: dict[Hashable, list[NodeSpan]] = defaultdict(list)
+        self._open: dict[Hashable, list[NodeSpan]] = defaultdict(list)
+        self._own: list[NodeSpan] = []
         self._instants: dict[Hashable, tuple[str, Mapping[str, Any]]] = {}
         self._count = 0
 
@@ -255,7 +255,7 @@ class _EventReader:
         else:
             self._read_timed(phase, event, at)
 
-    def spans(self) -> list[Span]:
+    def spans(self) -> list[NodeSpan]:
         """Return the spans, each with its parent and its instants."""
         spans = list(self._own)
         for track in self._tracks.values():
@@ -303,7 +303,7 @@ class _EventReader:
             case _:
                 self._intake.left_out(f"events of the phase {phase:.8}", "the format has no such phase")
 
-    def _add(self, track: Hashable, name: str, arguments: Mapping[str, Any], start: int, end: int | None) -> Span:
+    def _add(self, track: Hashable, name: str, arguments: Mapping[str, Any], start: int, end: int | None) -> NodeSpan:
         own = arguments.get(OWN)
         if isinstance(own, dict) and isinstance(own.get("node"), int):
             parameters = {key: each for key, each in arguments.items() if key != OWN}
@@ -312,7 +312,7 @@ class _EventReader:
                 self._own.append(span)
             return span
         self._count += 1
-        span = Span(-self._count, self._settings.types.get(name, name), arguments, start, end)
+        span = NodeSpan(-self._count, self._settings.types.get(name, name), arguments, start, end)
         span.kind = self._settings.kinds.get(span.dtype, "action")
         self._tracks[track].append(span)
         return span
@@ -351,12 +351,12 @@ def _own_span(
     end: int | None,
     *,
     has_objects: bool = True,
-) -> Span:
+) -> NodeSpan:
     """Return the node of an export of ours; where the file has no objects, their names take their places."""
     kind, failure, parent = own.get("kind"), own.get("failure"), own.get("parent")
     status = own.get("status")
     known: Any = status if isinstance(status, str) and status in _STATUSES else "UNKNOWN"
-    return Span(
+    return NodeSpan(
         own["node"],
         str(own.get("dtype") or dtype),
         {name: _object_of(each, has_objects=has_objects) for name, each in parameters.items()},
@@ -443,7 +443,7 @@ class _Trace:
     """The spans of one trace; the root of an episode of ours is not among them."""
 
     def __init__(self) -> None:
-        self.spans: dict[str, Span] = {}
+        self.spans: dict[str, NodeSpan] = {}
         self.resources: dict[str, Any] = {}
         self.begin, self.end, self.status = 2**63 - 1, 0, "UNKNOWN"
         self._root: str | None = None
@@ -468,7 +468,7 @@ class _Trace:
         if "kind" in own:
             span = _own_span({**own, "node": key, "parent": parent}, name, attributes, start, end, has_objects=False)
         else:
-            span = Span(key, settings.types.get(name, name), attributes, start, end, parent=parent)
+            span = NodeSpan(key, settings.types.get(name, name), attributes, start, end, parent=parent)
             span.kind = settings.kinds.get(span.dtype, "action")
             span.status, span.failure = _outcome(raw, settings)
         span.instants = [

@@ -18,7 +18,7 @@ from sqlalchemy import select
 from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
 from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy, name_of
-from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, Job, MemoryLocation, Workers
+from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask, Workers
 from pycrorm_async.learning.recorded_policy import record_policy
 from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, Tally, tally_of
 from pycrorm_async.learning.tree import check_leaf, learn
@@ -172,7 +172,7 @@ class _PhaseRunner:
         began, recorded_tally, counted = time.monotonic(), recorded_rollouts.tally_of(recorded), Tally()
         frame = recorded
         if len(recorded) < count:
-            job = Job(experiment.scene, policy, seed, episode_each=experiment.episode_each)
+            job = RolloutTask(experiment.scene, policy, seed, episode_each=experiment.episode_each)
             runs = recorded_rollouts.missing_runs(recorded["index"], count, length_max=ROLLOUTS_PER_RUN)
             counted = await self._workers.roll_out(
                 job,
@@ -449,7 +449,7 @@ class _Evaluator:
         self, name: str, scene: Scene, policy: Policy, seed: int | None = None, count: int | None = None
     ) -> Tally:
         count = self._rollouts if count is None else count
-        job = Job(scene, policy, self._seed if seed is None else seed, recorded=False)
+        job = RolloutTask(scene, policy, self._seed if seed is None else seed, recorded=False)
         runs = recorded_rollouts.missing_runs(
             (), count, length_max=min(ROLLOUTS_PER_RUN, -(-count // self._experiment.workers))
         )

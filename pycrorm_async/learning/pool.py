@@ -76,7 +76,7 @@ class MemoryLocation:
 
 
 @dataclass(frozen=True)
-class Job:
+class RolloutTask:
     """The parameters that the rollouts of one `roll_out` share.
 
     Attributes:
@@ -97,7 +97,7 @@ class Workers:
     The processes import the main module, so a script must use the pool below `if __name__ == "__main__":`.
 
     >>> async with Workers(2, MemoryLocation("sqlite:///learn.db")) as workers:
-    ...     tally = await workers.roll_out(Job(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])
+    ...     tally = await workers.roll_out(RolloutTask(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])
     """
 
     def __init__(self, count: int, place: MemoryLocation | None) -> None:
@@ -137,7 +137,7 @@ class Workers:
         await self._stack.aclose()
 
     async def roll_out(
-        self, job: Job, runs: Iterable[tuple[int, int]], report: Callable[[Tally], None] = lambda _: None
+        self, job: RolloutTask, runs: Iterable[tuple[int, int]], report: Callable[[Tally], None] = lambda _: None
     ) -> Tally:
         """Perform the runs of indexes (first, length); return when all are performed and, if recorded, visible.
 
@@ -276,7 +276,7 @@ async def _serve_jobs(pipe: Connection, place: MemoryLocation | None) -> None:
         if place is not None:
             opened = Memory.open(place.url, spool=place.spool, writer="daemon", settings=SETTINGS)
             memory = await stack.enter_async_context(opened)
-        job: Job | None = None
+        job: RolloutTask | None = None
         with suppress(EOFError):
             while True:
                 kind, content = await asyncio.to_thread(pipe.recv)
@@ -292,7 +292,7 @@ async def _serve_jobs(pipe: Connection, place: MemoryLocation | None) -> None:
                     pipe.send(("done", await asyncio.create_task(run, context=context)))
 
 
-async def _run(pipe: Connection, job: Job, first: int, count: int, memory: Memory | None) -> Tally:
+async def _run(pipe: Connection, job: RolloutTask, first: int, count: int, memory: Memory | None) -> Tally:
     reported_s = time.monotonic()
 
     def report(tally: Tally) -> None:

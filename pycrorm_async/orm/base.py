@@ -70,7 +70,7 @@ def _decoded(text: str | None) -> Any:
     return None if text is None else msgspec.json.decode(text)
 
 
-class Moment(TypeDecorator[datetime]):
+class UtcTime(TypeDecorator[datetime]):
     """An aware datetime, exact to the microsecond and read in UTC. A naive one is refused: it names no time zone."""
 
     impl = sa.BigInteger
@@ -87,6 +87,10 @@ class Moment(TypeDecorator[datetime]):
 
     def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[int | None], datetime | None]:  # noqa: ARG002
         return _moment
+
+
+Moment = UtcTime
+"""Its former name, kept until the next release, because mapped classes of users may import it."""
 
 
 class EnumName(TypeDecorator[Any]):
@@ -257,7 +261,7 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
         float: sa.Double(),
         str: sa.Text(),
         bool: sa.Boolean(),
-        datetime: Moment(),
+        datetime: UtcTime(),
         **{enum: EnumOfObject(enum) for enum in (Arms, Grasp, GripperState, ObjectType, TaskStatus)},
     }
 

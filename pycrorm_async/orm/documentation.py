@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import Table
 
-from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment, is_built_in, view_mappers
+from pycrorm_async.orm.base import EPISODE, Base, JsonText, UtcTime, is_built_in, view_mappers
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion
 from pycrorm_async.projections.columns import SCHEMA_FILE, Schema, Storage
 from pycrorm_async.projections.mapped_tables import column_storage, leaves_of
@@ -100,7 +100,7 @@ def describe(class_: Any) -> ViewDescription:
         key = name if isinstance(column, str) else _key_of(mapper, column)
         words = _of_values(texts.get(key) or texts.get(name) or "") if name not in _ALIKE else ""
         words = words or _USUAL.get(name, "")
-        parts = [words, _TIME if isinstance(kind, Moment) else ""]
+        parts = [words, _TIME if isinstance(kind, UtcTime) else ""]
         parts += ["JSON"] if isinstance(kind, JsonText) and "JSON" not in words else []
         if text := "; ".join(filter(None, parts)):
             columns[name] = text

@@ -29,7 +29,7 @@ from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
-from pycrorm_async.orm.base import EPISODE, Base, Moment, inherited_from, known_classes, map_leaves, one_of
+from pycrorm_async.orm.base import EPISODE, Base, UtcTime, inherited_from, known_classes, map_leaves, one_of
 from pycrorm_async.orm.episodes import Pose
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion, Object
 
@@ -42,7 +42,7 @@ _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "text": Text(),
     "enum": Text(),
     "boolean": Boolean(),
-    "datetime": Moment(),
+    "datetime": UtcTime(),
 }
 _OWNER: Final = "pycrorm_classes"
 """The key of a reference to the `DynamicClasses` in the metadata of its tables."""

@@ -179,7 +179,7 @@ class Contradiction(LayoutConflict):
     """A declaration contradicts another one, so it needs other names."""
 
 
-class DeclaredType(msgspec.Struct, frozen=True):
+class TypeTables(msgspec.Struct, frozen=True):
     """A dtype's kind, its tables (the oldest first) and the recorded types it descends from."""
 
     kind: str
@@ -210,7 +210,7 @@ class Layout(msgspec.Struct, frozen=True):
     """
 
     leaves: dict[str, dict[str, Storage]] = {}
-    types: dict[str, DeclaredType] = {}
+    types: dict[str, TypeTables] = {}
     user_views: dict[str, str] = {}
     kept: dict[str, MaterialisedView] = {}
     outdated: tuple[str, ...] = ()
@@ -226,7 +226,7 @@ class Layout(msgspec.Struct, frozen=True):
         for leaf in leaves:
             tables[leaf.table] = leaf.columns | tables.get(leaf.table, {})
             if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in {*types, *self.renamed}:
-                types[leaf.dtype] = DeclaredType(leaf.kind, (leaf.table,))
+                types[leaf.dtype] = TypeTables(leaf.kind, (leaf.table,))
         return msgspec.structs.replace(self, leaves=tables, types=types)
 
     def with_views(self, views: Mapping[str, str], kept: Mapping[str, MaterialisedView]) -> Self:
@@ -259,7 +259,7 @@ class Layout(msgspec.Struct, frozen=True):
                 raise Contradiction(
                     f"{each} was renamed to {self.renamed[each]}, so {dtype} cannot have the alias {each}: remove it"
                 )
-        present = self.types.get(dtype) or DeclaredType(declared.kind, ())
+        present = self.types.get(dtype) or TypeTables(declared.kind, ())
         same_type = [present, *(self.types[each] for each in former if each in self.types)]
         for type_ in same_type:
             if declared.kind != type_.kind:
@@ -285,7 +285,7 @@ class Layout(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(
             self,
             leaves=self.leaves | {declared.table: whole},
-            types=types | {dtype: DeclaredType(declared.kind, tables, declared.bases or present.bases)},
+            types=types | {dtype: TypeTables(declared.kind, tables, declared.bases or present.bases)},
             renamed=renamed | dict.fromkeys(former, dtype),
         )
 
@@ -353,7 +353,7 @@ class Layout(msgspec.Struct, frozen=True):
         former = [old for old, present in self.renamed.items() if present == dtype]
         return [dtype, *(table for table in reversed(tables) if table != table_name(dtype)), *former]
 
-    def _bases(self, each: DeclaredType) -> list[str]:
+    def _bases(self, each: TypeTables) -> list[str]:
         """Return the bases of the same kind: a motion is never an action, even if its class derives from one."""
         bases = [self.present_name(base) for base in each.bases]
         return [base for base in bases if base not in self.types or self.types[base].kind == each.kind]

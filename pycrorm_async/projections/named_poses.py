@@ -22,12 +22,12 @@ from pycrorm_async.store.stored import Span, StoredEvent
 _NAMED = frozenset({"ObjectAdded", "ObjectMoved", "NodeStarted"})
 
 
-class _Row(msgspec.Struct):
+class _NamedRow(msgspec.Struct):
     row: int
 
 
 class _Robot(msgspec.Struct):
-    object: _Row | None = None
+    object: _NamedRow | None = None
     pose: Any = None
 
 

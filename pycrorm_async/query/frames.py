@@ -35,7 +35,7 @@ from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError, MissingExtra
-from pycrorm_async.orm.base import EnumName, JsonText, Moment
+from pycrorm_async.orm.base import EnumName, JsonText, UtcTime
 from pycrorm_async.orm.rows import ClassOfRow
 from pycrorm_async.projections.derived_views import member
 from pycrorm_async.query.text import nearest
@@ -283,7 +283,7 @@ ColumnKind: TypeAlias = Literal[
 """The type of a column as far as frames and files distinguish it. `local time` is one without a time zone."""
 
 _KINDS: tuple[tuple[type[TypeEngine[Any]], ColumnKind, TypeEngine[Any] | None], ...] = (
-    (Moment, "time", sa.BigInteger()),
+    (UtcTime, "time", sa.BigInteger()),
     (EnumName, "enum", sa.String()),
     (ClassOfRow, "text", sa.String()),
     (JsonText, "json", sa.Text()),

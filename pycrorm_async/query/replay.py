@@ -29,7 +29,7 @@ LATEST_MAX = 100
 """Bounds the percepts and the searches for places of a replay, each: an episode may have many thousands."""
 
 
-class EventTime(NamedTuple):
+class ReplayTime(NamedTuple):
     """An event: its sequence, and the ns since the episode's first event."""
 
     sequence: int
@@ -46,8 +46,8 @@ class ReplayedNode:
     parameters: dict[str, Any]
     simulated: bool
     wall_ns: int
-    start: EventTime
-    end: EventTime | None = None
+    start: ReplayTime
+    end: ReplayTime | None = None
     status: str = "RUNNING"
     failure: event_types.FailureValue | None = None
     considered: int = 0
@@ -161,7 +161,7 @@ class EpisodeReplay:
         self.number, self.id = row.number, row.id
         self.dtypes: Mapping[str, str] = {}
         self.begin_ns = self.begin_wall_ns = self.wall_ns = 0
-        self.at = EventTime(0, 0)
+        self.at = ReplayTime(0, 0)
         self.started = EpisodeStarted("", "", "", "", "")
         self.ended: event_types.EpisodeEnded | None = None
         self.tags: tuple[str, ...] = ()
@@ -194,7 +194,7 @@ class EpisodeReplay:
         """
         if self.at.sequence == 0:
             self.begin_ns, self.begin_wall_ns = event.monotonic_ns, event.wall_ns
-        at = EventTime(event.sequence, event.monotonic_ns - self.begin_ns)
+        at = ReplayTime(event.sequence, event.monotonic_ns - self.begin_ns)
         try:
             happening = self._decoded(event)
             if happening is not None:
@@ -209,7 +209,7 @@ class EpisodeReplay:
             raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
         return happening_of(event) if self._samples or event.type != "StateSampled" else None
 
-    def _apply(self, event: StoredEvent, at: EventTime, happening: event_types.Happening) -> None:
+    def _apply(self, event: StoredEvent, at: ReplayTime, happening: event_types.Happening) -> None:
         match happening:
             case event_types.NodeStarted():
                 self._start(event, at, happening)
@@ -231,7 +231,7 @@ class EpisodeReplay:
             case _:
                 self.world.read(event.sequence, happening)
 
-    def _start(self, event: StoredEvent, at: EventTime, started: event_types.NodeStarted) -> None:
+    def _start(self, event: StoredEvent, at: ReplayTime, started: event_types.NodeStarted) -> None:
         parent = started.parent
         if self._strict and parent is not None and parent not in self.nodes:
             raise CannotFold(f"its parent {parent} never started")
@@ -246,7 +246,7 @@ class EpisodeReplay:
         node = self.nodes.get(sequence)
         return node.parameters if node is not None else None
 
-    def _end(self, at: EventTime, ended: event_types.NodeEnded) -> None:
+    def _end(self, at: ReplayTime, ended: event_types.NodeEnded) -> None:
         if (node := self.nodes.get(ended.node)) is None:
             raise CannotFold(f"node {ended.node} ends and never started")
         node.status, node.failure = ended.status, ended.failure

@@ -126,7 +126,7 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class CaseBlock:
     """Many cases, grouped by type.
 
     Attributes:
@@ -138,7 +138,7 @@ class Block:
     left_out: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, cases: Iterable[Case]) -> Block:
+    def of(cls, cases: Iterable[Case]) -> CaseBlock:
         """Make a block of cases.
 
         A block keeps a case without infinite numbers and long texts, and with rounded numbers.
@@ -161,25 +161,25 @@ class Block:
         """Yield the cases, group after group, the newest of each group first."""
         return (group.case(row) for group in self.groups.values() for row in range(len(group)))
 
-    def without(self, nodes: NDArray[np.int64]) -> Block:
+    def without(self, nodes: NDArray[np.int64]) -> CaseBlock:
         """Return the block without the cases of these nodes."""
         return self._kept({name: np.isin(each.nodes, nodes, invert=True) for name, each in self.groups.items()})
 
-    def of_episodes(self, first: int, end: int) -> Block:
+    def of_episodes(self, first: int, end: int) -> CaseBlock:
         """Return the block with the cases of the episodes from number `first` up to but not including `end`."""
         groups = self.groups.items()
         return self._kept({name: (each.episodes >= first) & (each.episodes < end) for name, each in groups})
 
-    def _kept(self, kept: Mapping[str, Mask]) -> Block:
+    def _kept(self, kept: Mapping[str, Mask]) -> CaseBlock:
         groups = {
             name: group if kept[name].all() else group.taken(kept[name])
             for name, group in self.groups.items()
             if kept[name].any()
         }
-        return Block(groups, self.left_out)
+        return CaseBlock(groups, self.left_out)
 
 
-def is_same(one: Block, other: Block) -> bool:
+def is_same(one: CaseBlock, other: CaseBlock) -> bool:
     """Return whether two blocks have equal cases; their dictionaries may have further words."""
     return one.groups.keys() == other.groups.keys() and all(
         _is_same_group(group, other.groups[name]) for name, group in one.groups.items()
@@ -201,7 +201,7 @@ def _is_same_group(one: Group, other: Group) -> bool:
     return True
 
 
-def merge(blocks: Sequence[Block]) -> Block:
+def merge(blocks: Sequence[CaseBlock]) -> CaseBlock:
     """Return one block with the cases of all."""
     by_type: dict[str, list[Group]] = {}
     for group in chain.from_iterable(block.groups.values() for block in blocks):
@@ -210,7 +210,7 @@ def merge(blocks: Sequence[Block]) -> Block:
     return _block([Group.joined(by_type[name]) for name in sorted(by_type)], left_out)
 
 
-def _block(groups: Sequence[Group], left_out: frozenset[str] = frozenset()) -> Block:
+def _block(groups: Sequence[Group], left_out: frozenset[str] = frozenset()) -> CaseBlock:
     """Return the block of these groups, with one dictionary for each feature, and without those that are too long."""
     words = {name: joined_words(each) for name, each in dictionaries(groups).items()}
     left_out |= {name for name, each in words.items() if each.word_count > WORDS_MAX}
@@ -221,7 +221,7 @@ def _block(groups: Sequence[Group], left_out: frozenset[str] = frozenset()) -> B
         )
         for group in groups
     )
-    return Block({group.type: group for group in united}, left_out)
+    return CaseBlock({group.type: group for group in united}, left_out)
 
 
 def dictionaries(groups: Iterable[Group]) -> Mapping[str, Sequence[Words]]:
@@ -271,7 +271,7 @@ class _BlockHeading(msgspec.Struct, array_like=True):
 _heading: Final = msgspec.msgpack.Decoder(_BlockHeading).decode
 
 
-def encode(block: Block) -> bytes:
+def encode(block: CaseBlock) -> bytes:
     """Return the bytes of a block."""
     groups: list[tuple[str, int, list[tuple[str, str]]]] = []
     arrays: list[NDArray[Any]] = []
@@ -285,7 +285,7 @@ def encode(block: Block) -> bytes:
     return b"".join(chain.from_iterable((each, bytes(-len(each) % 8)) for each in parts))
 
 
-def decode(data: bytes) -> Block:
+def decode(data: bytes) -> CaseBlock:
     """Return the block of the bytes that `encode` made; its arrays share their memory."""
     place = 8 + int.from_bytes(data[:8], "little")
     heading = _heading(data[8:place])
@@ -308,7 +308,7 @@ def decode(data: bytes) -> Block:
             else:
                 numbers[feature] = Column(array(kind, size))
         groups[name] = Group(name, *arrays, texts, numbers)
-    return Block(groups, frozenset(heading.left_out))
+    return CaseBlock(groups, frozenset(heading.left_out))
 
 
 def _kind(values: NDArray[Any]) -> str:
@@ -341,7 +341,7 @@ class CaseLibrary:
             present one.
     """
 
-    def __init__(self, blocks: Sequence[Block] = (), names: Mapping[str, str] = MappingProxyType({})) -> None:
+    def __init__(self, blocks: Sequence[CaseBlock] = (), names: Mapping[str, str] = MappingProxyType({})) -> None:
         self.blocks = tuple(blocks)
         self._names = names
         self._groups: dict[str | None, tuple[Group, ...]] = {}

@@ -53,7 +53,7 @@ from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import is_missing, row_of
 from pycrorm_async.projections.verify import ProjectionCheck
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
-from pycrorm_async.recall.blocks import EPISODE_SHIFT, Block, decode, encode, is_same, merge
+from pycrorm_async.recall.blocks import EPISODE_SHIFT, CaseBlock, decode, encode, is_same, merge
 from pycrorm_async.recall.columns import RESERVED, Case
 from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of
@@ -85,7 +85,7 @@ class CaseBatch(ProjectedBatch):
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         await super().ready(engine, generation)
         if self.cases:
-            rows = rows_of(Block.of(self.cases), generation)
+            rows = rows_of(CaseBlock.of(self.cases), generation)
             self._insertion = await dialect_of(engine).insertion(rows)
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:
@@ -107,7 +107,7 @@ class CaseCheck(ProjectionCheck):
 
     def __init__(self, projection: Projection, result: VerifyResult) -> None:
         super().__init__(projection, result)
-        self._blocks: dict[int, Block | None] = {}
+        self._blocks: dict[int, CaseBlock | None] = {}
 
     async def differences(
         self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
@@ -122,7 +122,7 @@ class CaseCheck(ProjectionCheck):
         ]
         blocks = [block for each in headings if (block := await self._block(connection, number, each)) is not None]
         left_out = frozenset().union(*(each.left_out for each in blocks))
-        folded = Block.of(rows.cases)
+        folded = CaseBlock.of(rows.cases)
         blocks = [each.of_episodes(episodes.first, end) for each in blocks]
         self.result.rows += sum(map(len, blocks))
         if not left_out and is_same(folded, merge(blocks)):
@@ -139,11 +139,11 @@ class CaseCheck(ProjectionCheck):
             differences += _compared(node, stored.get(node), expected.get(node))
         return differences
 
-    async def _block(self, connection: AsyncConnection, generation: int, heading: BlockHeading) -> Block | None:
+    async def _block(self, connection: AsyncConnection, generation: int, heading: BlockHeading) -> CaseBlock | None:
         """Read a block, once for all parts whose cases it contains. A damaged one is reported, and counts as empty."""
         kept = self._blocks
         if heading.number not in kept:
-            block: Block | None = None
+            block: CaseBlock | None = None
             try:
                 block = (await read_blocks(connection, generation, [heading.number])).get(heading.number)
                 if block is None or len(block) != heading.cases:
@@ -589,7 +589,7 @@ class BlockHeading(NamedTuple):
     episode_max: int
 
 
-def rows_of(block: Block, generation: int) -> RowsByTable:
+def rows_of(block: CaseBlock, generation: int) -> RowsByTable:
     """Return the row of a block in the table of this generation."""
     cases = len(block)
     level = _level_of(cases)
@@ -627,14 +627,14 @@ def select_numbers(name: str, generation: int) -> Select[Any]:
     return select_generation(name).outerjoin(blocks, true()).add_columns(blocks.c.id)
 
 
-async def read_blocks(connection: AsyncConnection, generation: int, numbers: Collection[int]) -> dict[int, Block]:
+async def read_blocks(connection: AsyncConnection, generation: int, numbers: Collection[int]) -> dict[int, CaseBlock]:
     """Read these blocks, by number; one that was merged in the meantime is left out.
 
     Raises `DamageError` for a block whose bytes were changed.
     """
     table = _blocks(generation)
     columns = table.c.id, table.c.checksum, table.c.data
-    blocks: dict[int, Block] = {}
+    blocks: dict[int, CaseBlock] = {}
     for number, checksum, data in await connection.execute(select(*columns).where(table.c.id.in_([*numbers]))):
         if isinstance(data, str) or zlib.crc32(data) != checksum:  # SQLite keeps a value of any type in a column
             raise DamageError(f"block {number} of recall is damaged: its bytes were changed: {_ADVICE}")

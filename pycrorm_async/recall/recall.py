@@ -39,7 +39,7 @@ from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall import search
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
-from pycrorm_async.recall.blocks import Block, CaseLibrary, merge
+from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, merge
 from pycrorm_async.recall.cases import (
     CaseProjection,
     FeatureFields,
@@ -338,7 +338,7 @@ class StoredBlocks(NamedTuple):
 
     generation: int
     numbers: frozenset[int]
-    added: Mapping[int, Block]
+    added: Mapping[int, CaseBlock]
 
 
 class BlockSource(Protocol):
@@ -371,8 +371,8 @@ class CaseReader:
         self._source = source
         self._running = running
         self._generation = -1
-        self._blocks: dict[int, Block] = {}
-        self._unstored = Block.of(())
+        self._blocks: dict[int, CaseBlock] = {}
+        self._unstored = CaseBlock.of(())
         self._unnumbered: Sequence[Case] = ()
         self._hidden: NDArray[np.int64] = _NO_NODES
         self._library = CaseLibrary()
@@ -426,7 +426,7 @@ class CaseReader:
             del self._blocks[number]
         self._blocks.update(stored.added)
         if running:
-            self._unstored = merge([self._unstored, Block.of(running)])
+            self._unstored = merge([self._unstored, CaseBlock.of(running)])
         if len(self._unstored) and (running or stored.added):
             first = self._unstored.nodes.min()
             nodes = [_NO_NODES, *(each.nodes[each.nodes >= first] for each in self._blocks.values())]
@@ -436,8 +436,8 @@ class CaseReader:
             self._library = CaseLibrary(self._visible(), self._names)
         return self._library
 
-    def _visible(self) -> list[Block]:
-        blocks = [*self._blocks.values(), self._unstored, Block.of(self._unnumbered)]
+    def _visible(self) -> list[CaseBlock]:
+        blocks = [*self._blocks.values(), self._unstored, CaseBlock.of(self._unnumbered)]
         if self._hidden.size:
             blocks = [each.without(self._hidden) for each in blocks]
         return [each for each in blocks if len(each)]

@@ -1,4 +1,4 @@
-"""`Frames` knows where frames are, so that a pose in one of them is recorded in the map."""
+"""`FramePlaces` knows where frames are, so that a pose in one of them is recorded in the map."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FRAMES_MAX: Final = 10_000
 """Bounds the frames kept; further ones are not known, and poses in them keep their frame."""
 
 
-class Frames:
+class FramePlaces:
     """The latest place of each frame, and the frame that it is relative to."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import NotEncodable, encoded
 from pycrorm_async.record.episode_writer import ActingRobot, EpisodeWriter
-from pycrorm_async.record.frames import Frames
+from pycrorm_async.record.frames import FramePlaces
 from pycrorm_async.record.values import PoseLike, recorded_as
 
 K = TypeVar("K", bound=Hashable)
@@ -138,7 +138,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         self._objects: dict[Hashable, RecordedObject] = {}
         self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
         self._identities: set[int] = set()
-        self.frames = Frames()
+        self.frames = FramePlaces()
 
     def holds(self, reference: event_types.ObjectReference | None) -> bool:
         """Return whether this episode has such a row; True for None."""

@@ -32,7 +32,7 @@ _CHANNELS_MAX: Final = 4_096
 _NAME_MAX: Final = 200
 
 
-class Block:
+class SampleBlock:
     """The samples of one stream that are not written yet."""
 
     def __init__(self, channels: tuple[str, ...]) -> None:
@@ -111,7 +111,7 @@ class SampleBlocks:
     """The blocks of one episode's streams."""
 
     def __init__(self) -> None:
-        self._blocks: dict[tuple[str, tuple[str, ...]], Block] = {}
+        self._blocks: dict[tuple[str, tuple[str, ...]], SampleBlock] = {}
 
     def add(
         self,
@@ -126,7 +126,7 @@ class SampleBlocks:
             return []
         block = self._blocks.get((name, channels))
         if block is None:
-            block = self._blocks[name, channels] = Block(channels)
+            block = self._blocks[name, channels] = SampleBlock(channels)
         full = []
         if block.count and block.node != node:
             full.append((block.node, block.take()))

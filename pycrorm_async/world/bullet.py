@@ -348,7 +348,7 @@ class BulletWorld:
 
 
 @dataclass(frozen=True, slots=True)
-class Attachment:
+class AttachedChild:
     """A child that moves with `link` of `parent` (None: its base link) at the pose `relative` to that link."""
 
     parent: Object
@@ -361,17 +361,17 @@ class Attachments:
     """All attachments of one world. Changing them moves no object and notifies no observer."""
 
     def __init__(self) -> None:
-        self._of_child: dict[Object, Attachment] = {}
+        self._of_child: dict[Object, AttachedChild] = {}
 
-    def __iter__(self) -> Iterator[Attachment]:
+    def __iter__(self) -> Iterator[AttachedChild]:
         """Iterate over the attachments in the order of their creation."""
         return iter(tuple(self._of_child.values()))
 
-    def of(self, child: Object) -> Attachment | None:
+    def of(self, child: Object) -> AttachedChild | None:
         """Return the attachment of `child` to its parent."""
         return self._of_child.get(child)
 
-    def on(self, parent: Object) -> tuple[Attachment, ...]:
+    def on(self, parent: Object) -> tuple[AttachedChild, ...]:
         """Return the attachments of direct children of `parent`."""
         return tuple(each for each in self._of_child.values() if each.parent is parent)
 
@@ -398,13 +398,13 @@ class Attachments:
     def put(self, parent: Object, child: Object, link: str | None) -> None:
         """Store the attachment of `child` to that link at its current pose, without checks."""
         relative = child.pose.relative_to(parent.link_pose(link))
-        self.keep(Attachment(parent, child, link, relative))
+        self.keep(AttachedChild(parent, child, link, relative))
 
-    def keep(self, attachment: Attachment) -> None:
+    def keep(self, attachment: AttachedChild) -> None:
         """Store an attachment; the caller ensures that the child is at its relative pose."""
         self._of_child[attachment.child] = attachment
 
-    def remove(self, parent: Object, child: Object) -> Attachment:
+    def remove(self, parent: Object, child: Object) -> AttachedChild:
         """Remove an attachment and return it. Raises `AttachmentRefused` if `child` is not attached to `parent`."""
         present = self._of_child.get(child)
         if present is None or present.parent is not parent:

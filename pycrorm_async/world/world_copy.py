@@ -29,7 +29,7 @@ from contextvars import ContextVar
 
 from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError
-from pycrorm_async.world.bullet import Attachment, BulletWorld, Object
+from pycrorm_async.world.bullet import AttachedChild, BulletWorld, Object
 from pycrorm_async.world.pose import ObjectType, WorldMode
 
 
@@ -48,7 +48,7 @@ def copied(world: BulletWorld) -> Iterator[BulletWorld]:
     with BulletWorld(WorldMode.DIRECT, engine=engine, copy_of=world) as copy:
         copies = {obj: _copy_object(obj, copy) for obj in world.objects}
         for each in world.attachments:
-            copy.attachments.keep(Attachment(copies[each.parent], copies[each.child], each.link, each.relative))
+            copy.attachments.keep(AttachedChild(copies[each.parent], copies[each.child], each.link, each.relative))
         yield copy
 
 

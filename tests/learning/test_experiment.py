@@ -27,7 +27,7 @@ from pycrorm_async.learning.experiment import (
     run,
     study,
 )
-from pycrorm_async.learning.pool import Job, MemoryLocation, WorkerLost, Workers
+from pycrorm_async.learning.pool import MemoryLocation, RolloutTask, WorkerLost, Workers
 from pycrorm_async.learning.rollouts import MoveAndPickUp, Tally, batch_rollout
 from pycrorm_async.learning.tree import learn
 from pycrorm_async.operations.daemon import serve
@@ -182,7 +182,7 @@ async def test_the_workers_end_when_their_parent_dies_and_nothing_is_lost(tmp_pa
 
 async def test_the_drainer_may_exit_and_later_records_are_drained_too(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
-    job = Job(Scene(), default_policy(), 5)
+    job = RolloutTask(Scene(), default_policy(), 5)
     leave, ready = asyncio.Event(), asyncio.Event()
     other = asyncio.create_task(serve(place.url, spool=None, stop=leave, report=lambda _: ready.set()))
     await ready.wait()
@@ -206,7 +206,7 @@ async def test_of_two_experiments_on_one_memory_the_first_to_end_leaves_the_othe
 
 
 async def test_workers_that_are_not_free_take_no_job() -> None:
-    job = Job(Scene(), default_policy(), 5, recorded=False)
+    job = RolloutTask(Scene(), default_policy(), 5, recorded=False)
     workers = Workers(1, None)
     with pytest.raises(CallerError, match="workers do one job at a time"):
         await workers.roll_out(job, [(0, 5)])
@@ -239,7 +239,7 @@ async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
     monkeypatch.setattr("pycrorm_async.learning.experiment.scene_variants", lambda _scene: ())
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
-        await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 200)])
+        await workers.roll_out(RolloutTask(Scene(), default_policy(), 69), [(400, 200)])
     small = replace(SMALL, rollouts=300, evaluate=20, held_out=60, workers=1, min_samples_leaf=5, resume=True)
     learned = await run(small, place)
     assert learned.default.tally.rollouts == 300
@@ -290,7 +290,7 @@ async def test_rollouts_are_not_repeated_when_learning_from_them_had_failed(
 async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
-        job = Job(Scene(), default_policy(), 5)
+        job = RolloutTask(Scene(), default_policy(), 5)
         forgotten = await workers.roll_out(replace(job, recorded=False), [(0, 30)])
         assert ask(place.url, "SELECT count(*) FROM event") == [(0,)]
         assert await workers.roll_out(job, [(0, 30)]) == forgotten
@@ -302,7 +302,7 @@ async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tm
 
 
 async def test_an_exception_of_a_worker_is_reported_in_one_line(tmp_path: Path) -> None:
-    job = Job(Scene(position=(float("nan"), 0.0, 0.0)), default_policy(), 1)
+    job = RolloutTask(Scene(position=(float("nan"), 0.0, 0.0)), default_policy(), 1)
     async with Workers(1, MemoryLocation(f"sqlite:///{tmp_path}/memory.db")) as workers:
         with pytest.raises(WorkerLost, match="a rollout worker failed: PoseRefused") as reports:
             await workers.roll_out(job, [(0, 5)])

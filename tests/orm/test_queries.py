@@ -61,7 +61,7 @@ from pycrorm_async.orm import (
     SpatialRelation,
     TaskTreeNode,
 )
-from pycrorm_async.orm.base import Moment
+from pycrorm_async.orm.base import UtcTime
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
@@ -306,7 +306,7 @@ async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: Event
     later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
     assert await every(breakfast, later) == [row(15), row(16)]
     with pytest.raises(ValueError, match="has no time zone"):
-        Moment().process_bind_param(datetime(2026, 1, 1), None)  # type: ignore[arg-type]  # noqa: DTZ001  the point
+        UtcTime().process_bind_param(datetime(2026, 1, 1), None)  # type: ignore[arg-type]  # noqa: DTZ001  the point
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm.base import Base, Moment
+from pycrorm_async.orm.base import Base, UtcTime
 from pycrorm_async.orm.documentation import described
 from pycrorm_async.orm.documentation import schema as declared_schema
 from pycrorm_async.projections.columns import SCHEMA
@@ -41,7 +41,7 @@ def test_every_column_of_a_time_has_its_unit_and_every_built_in_view_a_sentence(
     for name, table in Base.metadata.tables.items():
         assert views[name].text, name
         for column in table.columns:
-            if isinstance(column.type, Moment):
+            if isinstance(column.type, UtcTime):
                 assert views[name].columns[column.name].endswith("µs since 1970-01-01 00:00 UTC"), (name, column.name)
             if column.name.endswith("_ns"):
                 assert views[name].columns[column.name].startswith("ns of"), (name, column.name)

@@ -30,7 +30,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.columns import Layout
 from pycrorm_async.projections.custom_tables import learner_of
 from pycrorm_async.projections.fold import decode_events
-from pycrorm_async.recall.blocks import Block
+from pycrorm_async.recall.blocks import CaseBlock
 from pycrorm_async.recall.cases import CaseBatch, CaseProjection
 from pycrorm_async.recall.columns import Case
 from tests.projections.event_script import Script, declarations, declared, field, name_of, pose
@@ -94,7 +94,7 @@ def cases_of(*scripts: Script, first_number: int = 1) -> list[Case]:
     for number, script in enumerate(scripts, first_number):
         events = script.stored(number)
         assert rows.fold(events, decode_events(events)[0]) is None
-    return in_order(Block.of(rows.cases).cases()) if rows.cases else []
+    return in_order(CaseBlock.of(rows.cases).cases()) if rows.cases else []
 
 
 def in_order(cases: Iterable[Case]) -> list[Case]:

@@ -20,7 +20,7 @@ from pycrorm_async.operations.rebuild import rebuild_projection
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.recall.answer import Answer, Relation, Sequences, answer, relation, success_of
-from pycrorm_async.recall.blocks import Block, CaseLibrary
+from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary
 from pycrorm_async.recall.cases import CaseProjection
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import Recall
@@ -50,7 +50,7 @@ CASES = [
 
 
 def asked(cue: Cue) -> Answer:
-    return answer(cue, CaseLibrary([Block.of(CASES)]))
+    return answer(cue, CaseLibrary([CaseBlock.of(CASES)]))
 
 
 CUE = Cue(
@@ -135,7 +135,7 @@ def test_what_is_typical_is_counted_by_score() -> None:
 
 
 def test_the_typical_angle_is_that_around_the_circle() -> None:
-    yaw = answer(Cue(type="PickUpAction"), CaseLibrary([Block.of(CASES[:2])])).typical("stand_yaw")
+    yaw = answer(Cue(type="PickUpAction"), CaseLibrary([CaseBlock.of(CASES[:2])])).typical("stand_yaw")
     assert yaw is not None
     assert isinstance(yaw.value, float)
     assert abs(yaw.value) == pytest.approx(math.pi, abs=1e-6)
@@ -151,13 +151,13 @@ def test_a_page_shows_an_answer_without_obeying_its_texts() -> None:
 
 def test_a_page_of_a_long_answer_has_a_hundred_cases_and_counts_the_others() -> None:
     cases = [pick_up(number, height=1.0) for number in range(1, 151)]
-    page = answer(Cue(type="PickUpAction", k=150), CaseLibrary([Block.of(cases)]))._repr_html_()
+    page = answer(Cue(type="PickUpAction", k=150), CaseLibrary([CaseBlock.of(cases)]))._repr_html_()
     assert page.count("<tr>") == 101
     assert "… 50 more" in page
 
 
 def test_an_answer_without_cases_states_that() -> None:
-    empty = answer(Cue(type="FlyAction"), CaseLibrary([Block.of(CASES)]))
+    empty = answer(Cue(type="FlyAction"), CaseLibrary([CaseBlock.of(CASES)]))
     assert list(empty) == []
     assert empty.success is None
     assert empty.reasons == []
@@ -188,7 +188,7 @@ PLAN = [
 
 
 def library(cases: list[Case]) -> CaseLibrary:
-    return CaseLibrary([Block.of(cases[::2]), Block.of(cases[1::2])])
+    return CaseLibrary([CaseBlock.of(cases[::2]), CaseBlock.of(cases[1::2])])
 
 
 def test_next_and_previous_have_the_same_parent() -> None:

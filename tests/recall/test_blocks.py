@@ -14,7 +14,7 @@ from sqlalchemy import event
 
 from pycrorm_async import Reading
 from pycrorm_async.events.ids import row_id, row_key
-from pycrorm_async.recall.blocks import WORDS_MAX, Block, decode, encode, is_same, merge
+from pycrorm_async.recall.blocks import WORDS_MAX, CaseBlock, decode, encode, is_same, merge
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, StoredBlocks
 from pycrorm_async.recall.search import forgotten
@@ -36,7 +36,7 @@ def kept(cases: list[Case]) -> list[Case]:
 @settings(max_examples=50)
 @given(CASES)
 def test_a_block_returns_its_cases_from_its_bytes(cases: list[Case]) -> None:
-    block = decode(encode(Block.of(cases)))
+    block = decode(encode(CaseBlock.of(cases)))
     assert list(block.cases()) == kept(cases)
     assert len(block) == len(cases)
 
@@ -46,11 +46,11 @@ def test_a_block_returns_its_cases_from_its_bytes(cases: list[Case]) -> None:
 def test_the_same_cases_make_the_same_bytes_in_any_order_and_in_any_parts(
     cases: list[Case], chance: random.Random
 ) -> None:
-    data = encode(Block.of(cases))
+    data = encode(CaseBlock.of(cases))
     mixed = chance.sample(cases, len(cases))
     borders = sorted(chance.choices(range(len(cases) + 1), k=3))
     parts = [mixed[: borders[0]], mixed[borders[0] : borders[1]], mixed[borders[1] : borders[2]], mixed[borders[2] :]]
-    blocks = [decode(encode(Block.of(part))) for part in parts if part]
+    blocks = [decode(encode(CaseBlock.of(part))) for part in parts if part]
     assert encode(merge(blocks)) == data
 
 
@@ -61,8 +61,8 @@ def test_blocks_are_the_same_where_their_cases_are_whatever_else_they_had(
 ) -> None:
     episode = max(row_key(each.node).number for each in cases) + 1
     elsewhere = [each._replace(node=row_id(episode, row_key(each.node).sequence, 0), parent=None) for each in others]
-    block = Block.of(cases)
-    assert is_same(block, Block.of([*cases, *elsewhere]).of_episodes(0, episode))
+    block = CaseBlock.of(cases)
+    assert is_same(block, CaseBlock.of([*cases, *elsewhere]).of_episodes(0, episode))
     changed = chance.choice(cases)
     rest = [each for each in cases if each is not changed]
     symbols, numbers = {**changed.symbols, "changed": "yes"}, {**changed.numbers, "changed": 1.0}
@@ -76,17 +76,17 @@ def test_blocks_are_the_same_where_their_cases_are_whatever_else_they_had(
         [*rest, changed._replace(status="CHANGED")],
         [*rest, changed._replace(duration_s=None if changed.duration_s else 1.0)],
     ):
-        assert not is_same(block, Block.of(other))
+        assert not is_same(block, CaseBlock.of(other))
 
 
 def test_a_case_keeps_its_parent_and_that_it_was_simulated() -> None:
     case = Case(row_id(3, 9, 0), 5, "PlaceAction", {}, {}, "LOST", parent=row_id(3, 4, 0), simulated=True)
-    assert list(decode(encode(Block.of([case]))).cases()) == [case]
+    assert list(decode(encode(CaseBlock.of([case]))).cases()) == [case]
 
 
 def stored(case: Case) -> Case:
     """The case after it was stored."""
-    (stored,) = decode(encode(Block.of([case]))).cases()
+    (stored,) = decode(encode(CaseBlock.of([case]))).cases()
     return stored
 
 
@@ -102,18 +102,18 @@ def test_what_a_memory_cannot_compare_is_left_out_of_a_case() -> None:
 
 def test_a_feature_cannot_have_the_name_of_an_outcome() -> None:
     with pytest.raises(AssertionError, match="status"):
-        Block.of([Case(32, 0, "A", {"status": "x"}, {}, "FAILED")])
+        CaseBlock.of([Case(32, 0, "A", {"status": "x"}, {}, "FAILED")])
 
 
 def test_a_feature_with_too_many_words_is_left_out_and_stays_so() -> None:
     cases = [Case(row_id(1, n, 0), n, "A", {"arm": "LEFT", "id": f"{n}"}, {}, "FAILED") for n in range(1, 20_000)]
-    halves = [Block.of(cases[:10_000]), Block.of(cases[10_000:])]
+    halves = [CaseBlock.of(cases[:10_000]), CaseBlock.of(cases[10_000:])]
     assert [each.left_out for each in halves] == [frozenset(), frozenset()]
     merged = merge(halves)
     assert len(merged) > WORDS_MAX
     assert merged.left_out == {"id"}
     assert {name for case in merged.cases() for name in case.symbols} == {"arm"}
-    again = merge([decode(encode(merged)), Block.of(random_cases(3, seed=1))])
+    again = merge([decode(encode(merged)), CaseBlock.of(random_cases(3, seed=1))])
     assert again.left_out == {"id"}
 
 
@@ -127,7 +127,7 @@ class Memory:
 
     def __init__(self) -> None:
         self.generation = 1
-        self.blocks: dict[int, Block] = {}
+        self.blocks: dict[int, CaseBlock] = {}
         self.ended: list[Case] = []
         self.unnumbered: list[Case] = []
         self.read_numbers: list[int] = []
@@ -135,7 +135,7 @@ class Memory:
 
     def store(self, cases: Sequence[Case]) -> None:
         self._next += 1
-        self.blocks[self._next] = Block.of(cases)
+        self.blocks[self._next] = CaseBlock.of(cases)
 
     def merge(self, chance: random.Random) -> None:
         numbers = chance.sample(sorted(self.blocks), min(3, len(self.blocks)))

@@ -39,7 +39,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.recall import cases as stored_blocks
-from pycrorm_async.recall.blocks import Block
+from pycrorm_async.recall.blocks import CaseBlock
 from pycrorm_async.recall.cases import BLOCK_COLUMNS, BlockHeading, read_blocks, read_headings, rows_of
 from pycrorm_async.recall.columns import RESERVED, Case
 from pycrorm_async.recall.recall import Recall
@@ -292,7 +292,7 @@ async def take_right_arms(connection: AsyncConnection) -> None:
     number = (await read_headings(connection, 1001))[1].number
     block = (await read_blocks(connection, 1001, [number]))[number]
     changed = [case._replace(symbols={**case.symbols, "arm": "RIGHT"}) for case in block.cases() if case.symbols]
-    [[row]] = rows_of(Block.of(changed), 1001).values()
+    [[row]] = rows_of(CaseBlock.of(changed), 1001).values()
     values = dict(zip(BLOCK_COLUMNS, row[2:], strict=True))
     table_ = table(BLOCK, column("id"), column("data"), column("checksum"), column("cases"))
     values = {name: values[name] for name in ("data", "checksum", "cases")}

@@ -14,7 +14,7 @@ from pycrorm_async.events.ids import row_id
 from pycrorm_async.plan import ActionAbstract, PickUpAction, PlanFailure, simulated_robot
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectDesignatorDescription
 from pycrorm_async.plan.task import PastSuccess
-from pycrorm_async.recall.blocks import Block, CaseLibrary
+from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.experience import TRIES_MAX, Tries, best_first, tries_of
 from pycrorm_async.recall.recall import Recall, present_situation
@@ -43,7 +43,7 @@ def tried(
 
 
 def tries(*cases: Case, arm: Arms | None = None) -> Tries:
-    library = CaseLibrary([Block.of(cases)] if cases else [])
+    library = CaseLibrary([CaseBlock.of(cases)] if cases else [])
     return tries_of(library, ["PickUpAction", "CarefulPickUpAction"], ObjectType.MILK, arm)
 
 
@@ -120,8 +120,8 @@ def test_a_robot_without_a_torso_has_the_height_of_the_object_in_the_map() -> No
 
 
 def test_the_latest_tries_of_all_blocks_are_taken() -> None:
-    blocks = [Block.of([tried(number, -1 - number / 1e4)]) for number in range(1, 4)]
-    many = Block.of(tried(number, status="FAILED") for number in range(4, 4 + TRIES_MAX - 2))
+    blocks = [CaseBlock.of([tried(number, -1 - number / 1e4)]) for number in range(1, 4)]
+    many = CaseBlock.of(tried(number, status="FAILED") for number in range(4, 4 + TRIES_MAX - 2))
     known = tries_of(CaseLibrary([*blocks, many]), ["PickUpAction"], ObjectType.MILK, None)
     assert known.succeeded.size == TRIES_MAX
     assert np.flatnonzero(known.succeeded).size == 2

@@ -15,7 +15,7 @@ from pycrorm_async.events.ids import row_id
 from pycrorm_async.recall import search as activations
 from pycrorm_async.recall import search as searching
 from pycrorm_async.recall.answer import answer
-from pycrorm_async.recall.blocks import WORDS_MAX, Block, CaseLibrary, Group, decode, encode
+from pycrorm_async.recall.blocks import WORDS_MAX, CaseBlock, CaseLibrary, Group, decode, encode
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import cue_like
 from pycrorm_async.recall.search import (
@@ -149,7 +149,7 @@ def library_of(cases: list[Case], chance: random.Random) -> CaseLibrary:
     mixed = chance.sample(cases, len(cases))
     borders = sorted({0, len(cases), *(chance.randrange(len(cases)) for _ in range(chance.randrange(6)))})
     parts = [mixed[start:end] for start, end in pairwise(borders)]
-    return CaseLibrary([decode(encode(Block.of(part))) for part in parts])
+    return CaseLibrary([decode(encode(CaseBlock.of(part))) for part in parts])
 
 
 def found(cue: Cue, library: CaseLibrary) -> Answer:
@@ -194,7 +194,7 @@ def test_a_word_that_no_case_has_cannot_hide_a_case_that_matches_all_else() -> N
         Case(row_id(1, n, 0), n, "A", {"arm": "LEFT", "object_type": "MILK" if n % 2 else "BOWL"}, {}, "FAILED")
         for n in range(1, 10_001)
     ]
-    library = CaseLibrary([Block.of(cases)])
+    library = CaseLibrary([CaseBlock.of(cases)])
     cue = Cue(type="A", has=(("arm", "LEFT"), ("object_type", "CACTUS")))
     weights = weights_of(cue, library)
     assert weights.never_seen == (("object_type", "CACTUS"),)
@@ -211,7 +211,7 @@ def test_a_common_cue_ends_in_the_newest_rows(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(searching, "_matches", counted)
     cases = [Case(row_id(1, n, 0), n, "A", {"arm": "LEFT"}, {}, "FAILED") for n in range(1, 10_001)]
-    library = CaseLibrary([Block.of(cases[:5_000]), Block.of(cases[5_000:])])
+    library = CaseLibrary([CaseBlock.of(cases[:5_000]), CaseBlock.of(cases[5_000:])])
     assert len(found(Cue(type="A", has=(("arm", "LEFT"),), k=10), library)) == 10
     assert compared == [slice(0, 4_096)]
 
@@ -240,7 +240,7 @@ def use(sequence: int, age_s: float, arm: str, name: str = "A") -> Case:
 
 def activation(ages_s: list[float]) -> float:
     """Return the activation of a way with uses of these ages: the threshold from which on it is forgotten."""
-    library = CaseLibrary([Block.of(use(number, age_s, "L") for number, age_s in enumerate(ages_s, 1))])
+    library = CaseLibrary([CaseBlock.of(use(number, age_s, "L") for number, age_s in enumerate(ages_s, 1))])
     low, high = -50.0, 50.0
     for _ in range(60):
         middle = (low + high) / 2
@@ -265,7 +265,7 @@ def test_all_cases_of_a_way_have_its_activation(numbers_max: int, monkeypatch: p
     monkeypatch.setattr(activations, "_NUMBERS_MAX", numbers_max)
     chance = random.Random(2)
     cases = [use(n, chance.uniform(1, 9_000), chance.choice("LR"), chance.choice("AB")) for n in range(1, 200)]
-    library = CaseLibrary([Block.of(cases[:50]), Block.of(cases[50:])])
+    library = CaseLibrary([CaseBlock.of(cases[:50]), CaseBlock.of(cases[50:])])
 
     def hidden(threshold: float) -> set[int]:
         return set(forgotten(library, threshold=threshold, now_us=NOW_US).nodes.tolist())
@@ -280,7 +280,7 @@ def test_all_cases_of_a_way_have_its_activation(numbers_max: int, monkeypatch: p
 
 def test_what_is_forgotten_is_what_lies_below_the_threshold() -> None:
     cases = [use(1, 1.0, "L"), use(2, 2.0, "L"), use(3, 9_000.0, "R"), use(4, 8_000.0, "R"), use(5, 9_000.0, "L")]
-    library = CaseLibrary([Block.of(cases)])
+    library = CaseLibrary([CaseBlock.of(cases)])
     hidden = forgotten(library, threshold=-2.0, now_us=NOW_US)
     assert (hidden.cases, hidden.ways) == (2, 1)
     assert hidden.nodes.tolist() == [cases[2].node, cases[3].node]
@@ -293,7 +293,7 @@ def test_what_is_forgotten_is_what_lies_below_the_threshold() -> None:
 #
 # A cue that cannot be answered is refused in one line that names the nearest known feature.
 
-LIBRARY = CaseLibrary([Block.of(random_cases(50, seed=1))])
+LIBRARY = CaseLibrary([CaseBlock.of(random_cases(50, seed=1))])
 TYPE = "PickUpAction"
 
 BAD_CUES: dict[str, tuple[Cue, str]] = {
@@ -375,7 +375,7 @@ def test_a_type_or_a_word_that_never_occurred_is_no_error() -> None:
 def test_a_feature_with_too_many_words_is_refused_by_its_name() -> None:
     cases = [Case(row_id(1, n, 0), n, "A", {"id": f"{n}"}, {}, "FAILED") for n in range(1, WORDS_MAX + 2)]
     half = len(cases) // 2
-    library = CaseLibrary([Block.of(cases[:half]), Block.of(cases[half:])])
+    library = CaseLibrary([CaseBlock.of(cases[:half]), CaseBlock.of(cases[half:])])
     assert library.left_out == {"id"}
     with pytest.raises(CallerError, match="id has more than 16,384 different values"):
         check_cue(Cue(type="A", has=(("id", "5"),)), library)
@@ -391,7 +391,7 @@ def test_a_case_with_too_many_features_is_compared_by_those_that_weigh_most_and_
     common, rare = [f"common {number:03}" for number in range(150)], [f"rare {number:03}" for number in range(150)]
     others = [Case(row_id(1, n, 0), n, "A", {"near": tuple(common)}, numbers, "FAILED") for n in range(1, 100)]
     crowded = Case(row_id(1, 100, 0), 100, "A", {"near": (*common, *rare), "arm": "LEFT"}, numbers, "FAILED")
-    library = CaseLibrary([Block.of([*others, crowded])])
+    library = CaseLibrary([CaseBlock.of([*others, crowded])])
     cue = cue_like(crowded, library)
     assert (len(cue.has) + len(cue.near), cue.left_out) == (FEATURES_MAX, 361 - FEATURES_MAX)
     words = [word for _, word in cue.has]
