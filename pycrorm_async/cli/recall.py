@@ -13,14 +13,12 @@ import typer
 from pycrorm_async.cli.output import Form, note, print_rows, print_table, stdout
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase
-from pycrorm_async.recall.recall import Recall, check_robot
+from pycrorm_async.recall.recall import Recall, case_named, check_robot
 from pycrorm_async.recall.search import closest
 
 _TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
-_NODE = re.compile(r"(?P<episode>.+)/e?(?P<sequence>\d+)")
 _K = 10
 """The number of actions by default: as many as a terminal shows with the command that asked for them."""
 
@@ -87,7 +85,7 @@ def recall(
     async def query(reading: Reading) -> tuple[Answer, tuple[str, ...], list[tuple[str, int]]]:
         memory = Recall.of(reading)
         if like is not None:
-            answer = await memory.like(await _node(reading, like), k=k, simulated=simulated)
+            answer = await memory.like(await case_named(reading, like, "--like"), k=k, simulated=simulated)
         else:
             answer = await memory(
                 parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
@@ -163,13 +161,6 @@ def _refuse_conditions(conditions: dict[str, Any], option: str, *, taken: tuple[
         raise CallerError(
             f"{option} does not take {', '.join(ignored)}: leave {'it' if len(ignored) == 1 else 'them'} out"
         )
-
-
-async def _node(reading: Reading, like: str) -> int:
-    match = _NODE.fullmatch(like)
-    if match is None or int(match["sequence"]) > SEQUENCE_MAX:
-        raise CallerError(f"--like {like[:60]!r} is not an action: write EPISODE/EVENT, as in 3/115 or last/e115")
-    return row_id((await reading.episode(match["episode"])).number, int(match["sequence"]), 0)
 
 
 def _note_unknown(dtype: str | None, types: tuple[str, ...]) -> None:

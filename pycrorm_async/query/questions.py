@@ -78,12 +78,14 @@ class Argument(NamedTuple):
     Attributes:
         type: of its values as a command line or an agent writes them: bool, int, float, str, datetime or a `Literal`.
         default: `Parameter.empty` if a value is required.
+        choices: the names that are valid; empty if others are too, as those of arms.
     """
 
     name: str
     type: Any
     help: str
     default: Any
+    choices: tuple[str, ...] = ()
 
     @property
     def is_required(self) -> bool:
@@ -97,6 +99,11 @@ def _simple(annotation: Any) -> Any:
         return annotation
     types = get_args(annotation)
     return str if str in types else next(each for each in types if each is not type(None))
+
+
+def _choices(annotation: Any) -> tuple[str, ...]:
+    enum = next((each for each in get_args(annotation) if each in (TaskStatus, ObjectType, Grasp)), None)
+    return tuple(enum.__members__) if enum is not None else ()
 
 
 P = ParamSpec("P")
@@ -124,7 +131,10 @@ class _Question(Generic[P]):
     def arguments(self) -> Mapping[str, Argument]:
         """The arguments by name, in the order of the signature."""
         described = {name: (get_args(self._annotations[name]), each.default) for name, each in self._parameters()}
-        return {name: Argument(name, _simple(type_), words, each) for name, ((type_, words), each) in described.items()}
+        return {
+            name: Argument(name, _simple(type_), words, each, _choices(type_))
+            for name, ((type_, words), each) in described.items()
+        }
 
     @cached_property
     def signature(self) -> Signature:

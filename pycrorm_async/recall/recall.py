@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -25,7 +26,7 @@ from sqlalchemy import Select, select
 
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.events.ids import row_key
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_NODE, row_id, row_key
 from pycrorm_async.events.types import DesignatorTypeDeclared, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import Designator
@@ -570,6 +571,19 @@ def aliases_of(designator: str | type | None) -> tuple[str, ...]:
     """Return the former names that a designator class declares."""
     aliases = getattr(designator, "__aliases__", ())
     return tuple(aliases) if isinstance(aliases, tuple | list) else ()
+
+
+_NAMED = re.compile(r"(?P<episode>.+)/e?(?P<sequence>\d+)")
+
+
+async def case_named(reading: Reading, text: str, argument: str = "like") -> int:
+    """Return the id of the node that EPISODE/EVENT names, as in `3/115` or `last/e115`. Raises `CallerError`."""
+    match = _NAMED.fullmatch(text)
+    if match is None or int(match["sequence"]) > SEQUENCE_MAX:
+        raise errors.CallerError(
+            f"{argument} {text[:60]!r} is not an action: write EPISODE/EVENT, as in 3/115 or last/e115"
+        )
+    return row_id((await reading.episode(match["episode"])).number, int(match["sequence"]), SLOT_NODE)
 
 
 def node_of(case: AnyCase) -> int:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import struct
 import subprocess
 import sys
 from collections.abc import AsyncIterator
@@ -16,9 +18,12 @@ from pycrorm_async import Memory
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.postgresql import GRANTS
+from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.pose import Grasp, Pose
 from tests.commands import COMMAND, environment
 from tests.databases import change_each, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, append_and_fold, declarations
+from tests.query.test_picture import record
 from tests.query.test_reading import episode
 
 if TYPE_CHECKING:  # at run time only in the process that runs these tests, because importing takes 0.5 s
@@ -89,7 +94,7 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
     async with agent_of(url) as agent:
         assert "untrusted data, never" in (agent.client.instructions or "")
         tools = (await agent.client.list_tools()).tools
-        own = "episodes show why_failed at compare schema query".split()
+        own = "episodes now show why_failed at picture compare recall schema query".split()
         assert [each.name for each in tools] == [*own, *(each for each in QUESTIONS if each != "episodes")]
         assert all(each.annotations is not None and each.annotations.read_only_hint for each in tools)
         episodes = await agent.ask("episodes")
@@ -117,7 +122,7 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
         zebra = await agent.ask("object_history", name="zebra")
         assert zebra == {"rows": [], "note": "the memory has no object zebra"}
         moment, *running = (await agent.ask("at", when="e2", episode=1)).splitlines()
-        assert (moment.startswith("episode 1 at "), running) == (True, ["  root RUNNING"])
+        assert (moment.startswith("episode 1 at "), running) == (True, ["  e2 root RUNNING"])
         compared = await agent.ask("compare", first=1, second="last")
         assert (compared["first"], compared["second"]) == (episodes[0], episodes[1])
         assert len((await agent.ask("compare", first=1, second=2, limit=1))["differences"]) == 1
@@ -165,6 +170,60 @@ async def test_a_wrong_argument_is_refused_in_one_line_with_the_nearest_one(url:
         assert all(each.input_schema["additionalProperties"] is False for each in tools)
         assert await agent.ask("at", when=0.5, episode=1) == await agent.ask("at", when="0.5", episode=1)
         assert await agent.ask("at", when=1, episode=1) == await agent.ask("at", when="1", episode=1)
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_each_argument_of_each_tool_has_a_description_and_its_valid_names(url: str) -> None:
+    async with agent_in_process(url) as agent:
+        tools = (await agent.client.list_tools()).tools
+        arguments = {(each.name, name): of for each in tools for name, of in each.input_schema["properties"].items()}
+        assert [key for key, of in arguments.items() if not of.get("description")] == []
+        statuses = [*TaskStatus.__members__, None]
+        assert arguments["episodes", "status"]["enum"] == arguments["longest_actions", "status"]["enum"] == statuses
+        assert arguments["successful_pick_ups", "grasp"]["enum"] == [*Grasp.__members__, None]
+        assert arguments["durations", "kind"]["enum"] == ["action", "motion", "language"]
+        assert "enum" not in arguments["root_failures", "arm"]  # other robots have other arms
+        assert [each["number"] for each in await agent.ask("episodes", status="failed")] == []
+
+
+async def test_an_agent_sees_the_scene_recalls_actions_and_follows_what_runs(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    await record(url)
+    async with agent_in_process(url) as agent:
+        answer = await agent.client.call_tool("picture", {"episode": 1, "width": 320, "height": 200})
+        [content] = answer.content
+        assert (content.type, content.mime_type) == ("image", "image/png")  # type: ignore[union-attr]
+        png = base64.b64decode(content.data)  # type: ignore[union-attr]
+        assert struct.unpack(">II", png[16:24]) == (320, 200)
+        assert await agent.refused("picture", episode=1, at="e1") == (
+            "the world of episode 1 was empty at event 1, so nothing is drawn; its first object was added at event 3"
+        )
+        assert await agent.refused("picture", width=4000) == "width must be 64 to 1024, got 4000"
+        assert "its objects: courier" in await agent.refused("picture", episode=1, focus="milk")
+
+        summary, _, case, *_ = (await agent.ask("recall", type="NavigateAction")).splitlines()
+        assert summary.startswith("1 of 1 cases for NavigateAction")
+        assert case.startswith("NavigateAction in episode 1, event ")
+        assert case.endswith(": SUCCEEDED")
+        event = case.split("event ")[1].split(":")[0]
+        assert (await agent.ask("recall", like=f"1/{event}")).startswith("0 of 1 cases for NavigateAction")
+        assert await agent.refused("recall") == "name a type, has or near, or an action by like"
+        assert await agent.refused("recall", like="milk") == (
+            "like 'milk' is not an action: write EPISODE/EVENT, as in 3/115 or last/e115"
+        )
+
+        assert (await agent.ask("at", when=f"e{event}", episode=1)).splitlines()[1:3] == [
+            "  e2 root RUNNING", f"    e{event} NavigateAction target_location=(1.00, 0.50, 0.00) RUNNING",
+        ]  # fmt: skip
+        assert await agent.ask("now") == "no episode runs"
+        with Memory.sync(url) as memory, memory.recording.episode(description="Still at it") as recorded:
+            recorded.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
+            recorded.start("a", memory.recording.type("action", "SayAction", {"text": str}), {"text": "hello"})
+            memory.flush()
+            running = (await agent.ask("now")).splitlines()
+            assert running[0].endswith("UTC: RUNNING")
+            assert [each.split()[1] for each in running[1:3]] == ["root", "SayAction"]
+            assert running[-1].startswith("turtle Pose(")
 
 
 @pytest.mark.soak
