@@ -14,7 +14,7 @@ from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
-from pycrorm_async.report.write import Plot, overview
+from pycrorm_async.report.overview import Plot, overview
 from pycrorm_async.report.write import report as write_report
 
 

@@ -27,8 +27,9 @@ from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.frames import TRIED
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import parameters_text, with_object_names
-from pycrorm_async.report import write
 from pycrorm_async.report.document import EpisodePage, document_behind, read_into
+from pycrorm_async.report.overview import NO_REASON, failures_by_reason, newest_episodes, overview_document
+from pycrorm_async.report.write import outcomes_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named, grown_episodes, is_simulated
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -298,7 +299,7 @@ class LiveOverview:
     async def outcomes(self, log: EventLog, number: int) -> dict[str, str] | None:
         """Return the outcomes of an episode's failures; None while the tables do not show all its events."""
         is_behind = any(each.number == number for each in await log.behind())
-        return None if is_behind else await write.outcomes_of(self._reading, number)
+        return None if is_behind else await outcomes_of(self._reading, number)
 
     @property
     def turn(self) -> int:
@@ -332,7 +333,7 @@ class LiveOverview:
         self._asked_s = time.monotonic()
         shown = (self._unjudged - {each.number for each in await log.behind()}) & self._activities.keys()
         try:
-            outcomes = await write.failures_by_reason(self._reading, shown) if shown else {}
+            outcomes = await failures_by_reason(self._reading, shown) if shown else {}
         except (DatabaseUnavailable, TablesPending):  # the list shows what the events say
             return []
         self._unjudged -= shown
@@ -377,10 +378,10 @@ class LiveOverview:
         self._asked_s = -math.inf
         await self.catch_up(log, {each.number: each for each in [*await log.behind(), *running]}.values())
         try:
-            episodes, total = await write.newest_episodes(self._reading)
+            episodes, total = await newest_episodes(self._reading)
             episodes = episodes[-_LISTED_MAX:]
             pages = {each.number: f"episode/{each.number}" for each in episodes}
-            document = await write.overview_document(self._reading, "Episodes", episodes, total, pages, {})
+            document = await overview_document(self._reading, "Episodes", episodes, total, pages, {})
         except DatabaseUnavailable:  # it has no tables yet
             document = {"title": "Episodes", "total": 0, "episodes": []}
         entries = {each["number"]: each for each in document["episodes"]}
@@ -491,7 +492,7 @@ class Activity:
             return
         self._failed += 1
         if ended.node not in self._causes:
-            reason = reason_of(ended.failure) if ended.failure is not None else write.NO_REASON
+            reason = reason_of(ended.failure) if ended.failure is not None else NO_REASON
             self._reasons[reason] = self._reasons.get(reason, 0) + 1
         self._causes.discard(ended.node)
         if parent is not None:
@@ -509,7 +510,7 @@ class Activity:
         return [each[:_TEXT_MAX] for each in reversed(path) if each]
 
     def entry(self) -> dict[str, Any]:
-        """Return its row, with the keys of `report.write`; its times are those of the tables, in µs."""
+        """Return its row, with the keys of `report.overview`; its times are those of the tables, in µs."""
         return {
             "number": self.row.number,
             "started": f"{datetime.fromtimestamp(self.row.started_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}",

@@ -27,7 +27,8 @@ from pycrorm_async import __version__
 from pycrorm_async.errors import CallerError, MissingExtra, PycrormError, UnknownEpisode
 from pycrorm_async.live.access import HEADERS, refusal
 from pycrorm_async.live.follower import OUTCOMES_S, EpisodeFeed, LogFollower, wait_unless
-from pycrorm_async.report.write import overview_page_of, page_of
+from pycrorm_async.report.overview import overview_page_of
+from pycrorm_async.report.write import page_of
 
 try:
     import uvicorn

@@ -16,7 +16,7 @@ from pycrorm_async.live.server import LiveServer, listen
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report import document as episode_fold
-from pycrorm_async.report.write import newest_episodes, overview_document
+from pycrorm_async.report.overview import newest_episodes, overview_document
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Pose
 from tests.databases import ask, ask_to_change, put_memory

@@ -21,7 +21,7 @@ from pycrorm_async.plan import ActionAbstract, PlanFailure, Sequential, TryInOrd
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.recall.answer import Relation
 from pycrorm_async.report.document import episode_document
-from pycrorm_async.report.write import overview_document
+from pycrorm_async.report.overview import overview_document
 from tests.commands import pycrorm
 from tests.databases import ask
 

@@ -13,7 +13,7 @@ from pycrorm_async.projections import verify as verification
 from pycrorm_async.projections.fold import fold_happening
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report import document
-from pycrorm_async.report.write import overview
+from pycrorm_async.report.overview import overview
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.cli.hostile_memory import record_hostile_episodes

@@ -16,7 +16,8 @@ from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.memory import SyncMemory
 from pycrorm_async.query.success import Samples, Values, interval_95, success_figure
 from pycrorm_async.recall.recall import Recall
-from pycrorm_async.report.write import newest_episodes, outcomes_of, overview_document
+from pycrorm_async.report.overview import newest_episodes, overview_document
+from pycrorm_async.report.write import outcomes_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.pose import Pose
 from tests.integrations.test_mcp_server import agent_in_process

@@ -13,7 +13,7 @@ from pycrorm_async.events.reasons import reason_of, template_of
 from pycrorm_async.events.types import FailureValue
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.report.document import episode_document
-from pycrorm_async.report.write import failures_by_reason
+from pycrorm_async.report.overview import failures_by_reason
 
 CAUSES: list[tuple[Any, str]] = [
     ("the left wheel slipped", "the left wheel slipped"),

@@ -25,9 +25,10 @@ from pycrorm_async.cli.output import Chosen
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
-from pycrorm_async.report import document, write
+from pycrorm_async.report import document
+from pycrorm_async.report import overview as overview_file
 from pycrorm_async.report.output_files import new_file, new_folder, write_file
-from pycrorm_async.report.write import overview
+from pycrorm_async.report.overview import overview
 from tests.commands import one_line_of, pycrorm
 from tests.full_disk import files_of_at_most
 
@@ -116,13 +117,13 @@ def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path:
 def test_a_table_of_many_episodes_has_the_newest_and_says_how_many_it_left_out(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(write, "_EPISODES_MAX", 2)
-    monkeypatch.setattr(write, "_PAGES_MAX", 1)
+    monkeypatch.setattr(overview_file, "_EPISODES_MAX", 2)
+    monkeypatch.setattr(overview_file, "_PAGES_MAX", 1)
     url = f"sqlite:///{recorded}/pycrorm.db"
 
     async def newest(choice: EpisodeChoice | None) -> tuple[list[int], int]:
         async with Reading.open(url) as reading:
-            listed, total = await write.newest_episodes(reading, choice)
+            listed, total = await overview_file.newest_episodes(reading, choice)
             return [each.number for each in listed], total
 
     for choice, total in ((None, 3), (EpisodeChoice(limit=3), 3), (EpisodeChoice(limit=2), 2)):

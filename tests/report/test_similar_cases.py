@@ -18,7 +18,8 @@ from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.report import write as similar_cases
-from pycrorm_async.report.write import SimilarCases, overview, report
+from pycrorm_async.report.overview import overview
+from pycrorm_async.report.write import SimilarCases, report
 from tests.report.browser import Browser
 
 HOSTILE = "</script><b onload=alert(1)>"
