@@ -377,7 +377,7 @@ class Recording:
 
     def _put(self, event: Happening) -> int:
         self.events += 1
-        return self._episode.put(event)
+        return self._episode.events.put(event)
 
     def _episode_writer(self, name: EpisodeId) -> EpisodeWriter:
         return EpisodeWriter(self._emitter, name, EpisodeOpening("rollouts", "bench"))

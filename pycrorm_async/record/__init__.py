@@ -4,8 +4,9 @@
 what an episode consists of: its beginning and end, the starts and ends of its nodes, percepts, tags and observations.
 `ObjectRows` keeps the rows of its objects, and `values` reads live values.
 
-`RecordedEpisode` takes keys and values of any executive, from any thread: it copies and converts them first, keeps the
-last state of each object, because it cannot ask for it again, and runs the calls of all episodes one after the other.
+`RecordedEpisode` takes keys and values of any executive, from any thread, and copies and converts them. Its writer, a
+`KeyedEpisode`, runs the calls of all episodes one after the other, knows nodes and objects by their keys, and keeps the
+last state of each object, because an executive cannot be asked for it again.
 
 `plan_recorder`, `plan_types` and `geometry` are the adapters of our own plan layer and world: the hooks read live
 designators, and a world that reports its changes in the plan's own thread, so they copy nothing twice and take no lock.

@@ -1,11 +1,11 @@
 """An `EpisodeWriter` writes the events of one open episode.
 
 Theory of operation. The writer does not know the executive: it names nodes by the sequences of their starts, and
-objects by whatever the executive uses. `_open` holds every node that started and whose end is not written, with the
-name of its type. The call that removes a node writes its end, so no node has two. Ctrl-C can come at any call: a node
-whose start or end it interrupted may have no end, and ends with its episode. `_ending` holds a node while a thread
-writes its end. The ends of episodes wait, for a limited time, until it is empty, because the end of a node must precede
-the end of its episode. The end of a node never waits, because the garbage collector may cause it.
+objects by whatever the executive uses. `NodeEvents._open` holds every node that started and whose end is not written,
+with the name of its type. The call that removes a node writes its end, so no node has two. Ctrl-C can come at any call:
+a node whose start or end it interrupted may have no end, and ends with its episode. `NodeEvents._ending` holds a node
+while a thread writes its end. The ends of episodes wait, for a limited time, until it is empty, because the end of a
+node must precede the end of its episode. The end of a node never waits, because the garbage collector may cause it.
 """
 
 from __future__ import annotations
@@ -90,10 +90,11 @@ class EpisodeWriter:
     Attributes:
         emitter: has the queue, and counts faults.
         id: 16 bytes of a UUID; `str(episode)` is its text.
+        events: writes its events.
+        nodes: writes the starts and ends of its nodes.
         closed: whether the last event has been written, or its writing has begun.
         simulated: whether the episode is a simulation.
         failures: copies the exceptions with which its nodes end.
-        refusal: of a named episode: why nothing more is recorded, although it has no end; None without a reason.
     """
 
     def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
@@ -101,19 +102,12 @@ class EpisodeWriter:
         self.closed = False
         self.simulated: Final = opening.simulated
         self.emitter = emitter
+        self.events: Final = EpisodeEvents(emitter, episode)
+        self.nodes: Final = NodeEvents(self.events, simulated=opening.simulated)
         self.failures: Final = FailureCopies()
         self._opening = opening
-        self._headings: dict[type[Happening], Heading] = {}
-        self._open: dict[int, str] = {}
-        self._ending: set[int] = set()
         self._is_begun = False
         self._is_ended = False
-        self._root = 0
-        self.time: tuple[int, int] | None = None
-        """The wall time and the monotonic time of the next events, ns; None for those of the clock."""
-        self.refusal: str | None = None
-        self._recorded: RecordedBefore | None = None
-        self._stored = 0
 
     def __str__(self) -> str:
         return episode_text(self.id)
@@ -140,9 +134,85 @@ class EpisodeWriter:
 
     def node_or_root(self, _node: Any, /) -> int:
         """Return the sequence of this node or of its nearest recorded ancestor; else that of the root."""
-        return self._root
+        return self.nodes.root
 
-    # --- events -----------------------------------------------------------------------------------------------
+    def open(self) -> None:
+        """Write the start of the episode and of its root node."""
+        self._is_begun = True  # also if Ctrl-C comes before the next line returns
+        try:
+            self.events.put(_started(self._opening, self.emitter), "Episode")
+        except Exception:
+            self._is_begun = False
+            raise
+        self.nodes.start_root()
+
+    def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
+        """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
+        tags = changed_tags(self._opening.labels.tags, added, removed)
+        self.events.put(EpisodeTagged(tuple(added), tuple(removed)))
+        self._opening = self._opening.with_tags(tags)
+
+    def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
+        """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.
+
+        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written; and if
+        its own status is not known, UNKNOWN.
+
+        After a call that Ctrl-C interrupted, the next call writes what is missing.
+        """
+        if self._is_ended or not self._is_begun:
+            self.closed = True
+            return
+        self.closed = True
+        status, root_status = self._end_statuses(failure)
+        value = self.failures.copy(failure, self) if failure is not None else None
+        is_same = status in ("INTERRUPTED", "UNKNOWN")
+        self.nodes.end_all(root_status if is_same else "LOST", untimed=status == "UNKNOWN")
+        self.nodes.end(self.nodes.root, root_status, value)
+        self.events.put(EpisodeEnded(status, value, world=world), "Episode")
+        self._is_ended = True
+
+    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+        """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
+        return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
+
+
+def _started(opening: EpisodeOpening, emitter: Emitter) -> Happening:
+    """Return the first event of an episode, with texts that its columns can show."""
+    started: Happening = episode_started(opening)
+    reasons: dict[str, str] = {}
+    if not fits(started, emitter.record_bytes_max):
+        started, reasons = fitted(started, emitter.record_bytes_max)
+    for name in ("description", "plan", "world"):
+        text = getattr(started, name)
+        if text is not None and len(text) > EPISODE_TEXT_MAX:
+            started = replace(started, **{name: cut(text, EPISODE_TEXT_MAX)})
+            reasons[name] = "its text is too long for an episode and was cut"
+    emitter.note_missing("Episode", reasons)
+    return started
+
+
+# === events of an episode =====================================================================================
+#
+# `EpisodeEvents` encodes the events of one episode and puts them into the queue; `NodeEvents` sees to it that each node
+# ends once.
+
+
+class EpisodeEvents:
+    """Writes the events of one episode.
+
+    Attributes:
+        time: the wall time and the monotonic time of the next events, ns; None for those of the clock.
+    """
+
+    def __init__(self, emitter: Emitter, episode: EpisodeId) -> None:
+        self.emitter = emitter
+        self.time: tuple[int, int] | None = None
+        self._episode = episode
+        self._headings: dict[type[Happening], Heading] = {}
+        self._recorded: RecordedBefore | None = None
+        self._refused: Callable[[Exception], None] = lambda _error: None
+        self._stored = 0
 
     def put(
         self,
@@ -172,8 +242,8 @@ class EpisodeWriter:
                 given.parameters.update(event.parameters)  # so that the caller sees what was left out
         heading = self._headings.get(kind)
         if heading is None:
-            heading = self._headings[kind] = Heading(self.id, kind.__name__, kind.version)
-        if self._recorded is not None and (sequence := self._stored_before(heading, payload)):
+            heading = self._headings[kind] = Heading(self._episode, kind.__name__, kind.version)
+        if self._recorded is not None and (sequence := self._stored_before(self._recorded, heading, payload)):
             return sequence
         try:
             sequence = emitter.sink.put_nowait(heading, payload, reserved=reserved, at=self.time, after=self._stored)
@@ -184,57 +254,48 @@ class EpisodeWriter:
         self._stored = 0  # the queue has the episode's sequence from now on
         if emitter.feed.observers:
             whole = {name: each for name, each in shown.items() if getattr(event, name) is getattr(given, name)}
-            emitter.feed.publish(self.id, sequence, replace(event, **whole) if whole else event)
+            emitter.feed.publish(self._episode, sequence, replace(event, **whole) if whole else event)
         return sequence
 
-    def _stored_before(self, heading: Heading, payload: bytes) -> int:
-        """Return the sequence that this event has in the log; 0 behind the last stored one, where writing continues.
+    def continue_behind(self, recorded: RecordedBefore, refused: Callable[[Exception], None]) -> None:
+        """Write only events behind the stored ones, with which the first events are compared instead.
 
-        Raises `CallerError` if another event is stored in its place; then nothing more is recorded.
+        If one differs, `refused` is called with the error, which `put` then raises: nothing more may be put.
         """
-        assert self._recorded is not None
+        self._recorded, self._refused = recorded, refused
+
+    def _stored_before(self, recorded: RecordedBefore, heading: Heading, payload: bytes) -> int:
+        """Return the sequence that this event has in the log; 0 behind the last stored one, where writing continues."""
         try:
-            sequence = self._recorded.sequence_of(heading, payload)
+            sequence = recorded.sequence_of(heading, payload)
         except Exception as error:
-            self.refusal = message_of(error)
-            self.closed = self._is_ended = True
+            self._refused(error)
             raise
         if sequence == 0:
-            self._stored, self._recorded = self._recorded.head, None
+            self._stored, self._recorded = recorded.head, None
         return sequence
 
-    def open(self) -> None:
-        """Write the start of the episode and of its root node."""
-        self._is_begun = True  # also if Ctrl-C comes before the next line returns
-        try:
-            self.put(self._started(), "Episode")
-        except Exception:
-            self._is_begun = False
-            raise
-        self._root = self.put(NodeStarted("root", simulated=self.simulated))
-        self._open[self._root] = "Episode"
 
-    def _started(self) -> Happening:
-        """Return the first event, with texts that its columns can show."""
-        started: Happening = episode_started(self._opening)
-        reasons: dict[str, str] = {}
-        if not fits(started, self.emitter.record_bytes_max):
-            started, reasons = fitted(started, self.emitter.record_bytes_max)
-        for name in ("description", "plan", "world"):
-            text = getattr(started, name)
-            if text is not None and len(text) > EPISODE_TEXT_MAX:
-                started = replace(started, **{name: cut(text, EPISODE_TEXT_MAX)})
-                reasons[name] = "its text is too long for an episode and was cut"
-        self.emitter.note_missing("Episode", reasons)
-        return started
+class NodeEvents:
+    """Writes the starts and ends of one episode's nodes.
 
-    def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
-        """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
-        tags = changed_tags(self._opening.labels.tags, added, removed)
-        self.put(EpisodeTagged(tuple(added), tuple(removed)))
-        self._opening = self._opening.with_tags(tags)
+    Attributes:
+        root: the sequence of the root's start; 0 before it.
+    """
 
-    def put_start(
+    def __init__(self, events: EpisodeEvents, *, simulated: bool) -> None:
+        self.root = 0
+        self._events = events
+        self._simulated = simulated
+        self._open: dict[int, str] = {}
+        self._ending: set[int] = set()
+
+    def start_root(self) -> None:
+        """Write the start of the root."""
+        self.root = self._events.put(NodeStarted("root", simulated=self._simulated))
+        self._open[self.root] = "Episode"
+
+    def start(
         self,
         declared: DeclaredType,
         kind: NodeKind,
@@ -251,21 +312,21 @@ class EpisodeWriter:
         `whole` are the parameters for observers, with the poses that `parameters` names in nodes around. Raises
         `Unrecordable` if `may_refuse` and the settings ask for it.
         """
-        owner = declared.dtype
+        owner, emitter = declared.dtype, self._events.emitter
         if missing:
-            self.emitter.note_missing(owner, missing, may_refuse=may_refuse)
+            emitter.note_missing(owner, missing, may_refuse=may_refuse)
         written = cast("RobotValue", robot.written) if robot is not None else None
-        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, written, self.simulated)
+        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, written, self._simulated)
         shown: dict[str, Any] = {}
-        if self.emitter.feed.observers:
+        if emitter.feed.observers:
             shown = {} if robot is None else {"robot": robot.state}
             if whole is not None:
                 shown["parameters"] = whole
-        sequence = self.put(event, owner, may_refuse=may_refuse, shown=shown)
+        sequence = self._events.put(event, owner, may_refuse=may_refuse, shown=shown)
         self._open[sequence] = owner
         return sequence
 
-    def put_end(
+    def end(
         self,
         node: int,
         status: NodeStatus,
@@ -283,40 +344,18 @@ class EpisodeWriter:
                     parts = {"failure": failure.arguments if failure is not None else None, "result": result}
                     for name, value in parts.items():
                         for each in missing_in(value):
-                            self.emitter.missing.note(owner, name, each.missing)
-                self.put(NodeEnded(node, status, failure, result, untimed), owner)
+                            self._events.emitter.missing.note(owner, name, each.missing)
+                self._events.put(NodeEnded(node, status, failure, result, untimed), owner)
         finally:
             self._ending.discard(node)
 
-    # --- the end ----------------------------------------------------------------------------------------------
-
-    def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
-        """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.
-
-        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written; and if
-        its own status is not known, UNKNOWN.
-
-        After a call that Ctrl-C interrupted, the next call writes what is missing.
-        """
-        if self._is_ended or not self._is_begun:
-            self.closed = True
-            return
-        self.closed = True
-        status, root_status = self._end_statuses(failure)
-        value = self.failures.copy(failure, self) if failure is not None else None
-        for sequence in sorted(self._open.keys() - {self._root}, reverse=True):
-            is_same = status in ("INTERRUPTED", "UNKNOWN")
-            self.put_end(sequence, root_status if is_same else "LOST", untimed=status == "UNKNOWN")
+    def end_all(self, status: NodeStatus, *, untimed: bool) -> None:
+        """Write the ends of all open nodes but the root, the last one first; wait for ends in other threads."""
+        for node in sorted(self._open.keys() - {self.root}, reverse=True):
+            self.end(node, status, untimed=untimed)
         deadline = time.monotonic() + _LAST_ENDS_S
         while self._ending and time.monotonic() < deadline:
-            time.sleep(0.001)  # other threads write the ends of nodes
-        self.put_end(self._root, root_status, value)
-        self.put(EpisodeEnded(status, value, world=world), "Episode")
-        self._is_ended = True
-
-    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
-        """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
-        return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
+            time.sleep(0.001)
 
 
 # === emitter ==================================================================================================
@@ -686,7 +725,7 @@ def put_observation(episode: EpisodeWriter, name: object, values: object, node: 
         if reader.missing:
             reasons = {path or "values": reason for path, reason in reader.missing.items()}
             emitter.note_missing(owner, reasons, may_refuse=may_refuse)
-        return episode.put(event, owner, may_refuse=may_refuse, reserved=False)
+        return episode.events.put(event, owner, may_refuse=may_refuse, reserved=False)
     except (EpisodeFull, SpoolFull, SpoolStuck) as refusal:
         emitter.missing.note("observation", name, str(refusal))
         return 0

@@ -80,7 +80,7 @@ class ObjectRows(Generic[K]):
             return 0
         try:
             event = build()
-            self.last = sequence = self._episode.put(event)
+            self.last = sequence = self._episode.events.put(event)
         except Exception as error:  # noqa: BLE001  a change of the world must not fail because of a memory
             self._emitter.note_fault("a change of the world", error)
             return 0

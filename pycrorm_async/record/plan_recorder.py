@@ -172,12 +172,12 @@ class Episode(EpisodeWriter):
             if record is not None and record.episode is self:
                 return record.sequence
             node = node.parent
-        return self._root
+        return self.nodes.root
 
     def sequence_of(self, node: TaskTreeNode | None) -> int | None:
         """Return the sequence of this node or of its nearest recorded ancestor; None if there is none."""
         sequence = self.node_or_root(node)
-        return sequence if sequence != self._root else None
+        return sequence if sequence != self.nodes.root else None
 
     def robot_state(self) -> ActingRobot | None:
         """Return the state of the robot that acts in this context; None if no robot acts, or in a second world."""
@@ -321,7 +321,7 @@ class Recorder:
             if fields and poses:
                 values.name_known(parameters, fields, poses)
             above = episode.node_or_root(node.parent)
-            sequence = episode.put_start(
+            sequence = episode.nodes.start(
                 declared, node.kind, above, parameters, robot, missing, whole=whole, may_refuse=True
             )
             if fields:
@@ -351,7 +351,7 @@ class Recorder:
         try:
             failure = episode.failures.copy(node.failure, episode) if node.failure is not None else None
             result = encode_or_missing(node.result, episode) if node.result is not None else None
-            episode.put_end(sequence, node.status._value_, failure, result)  # `value` takes 0.1 µs longer
+            episode.nodes.end(sequence, node.status._value_, failure, result)  # `value` takes 0.1 µs longer
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("NodeEnded", error)
         if record.implicit:
@@ -362,7 +362,7 @@ class Recorder:
     def location_resolved(self, search: Search) -> None:
         self._in_episode(
             "LocationResolved",
-            lambda episode: episode.put(
+            lambda episode: episode.events.put(
                 location_resolved(search, episode.sequence_of(search.node)), clean(search.location)
             ),
         )
@@ -370,7 +370,7 @@ class Recorder:
     def object_detected(self, *, node: TaskTreeNode | None, **percepts: Any) -> None:
         self._in_episode(
             "ObjectDetected",
-            lambda episode: episode.put(object_detected(episode, node=episode.sequence_of(node), **percepts)),
+            lambda episode: episode.events.put(object_detected(episode, node=episode.sequence_of(node), **percepts)),
         )
 
     def simulation_started(self, simulation: Simulation) -> None:
@@ -883,7 +883,7 @@ class Sampler:
         if not changed or motion.is_over or self._emitter.is_closed:
             return
         try:
-            motion.episode.put(StateSampled(reference, changed, motion.node), reserved=False)
+            motion.episode.events.put(StateSampled(reference, changed, motion.node), reserved=False)
         except (EpisodeFull, SpoolFull, SpoolStuck):
             self.omitted += 1
             return

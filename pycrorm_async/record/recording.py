@@ -17,6 +17,7 @@ from pycrorm_async.record.arguments import Convert
 from pycrorm_async.record.declarations import RecordedKind
 from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
 from pycrorm_async.record.event_times import At, event_time
+from pycrorm_async.record.keyed_episode import OrderedCalls
 from pycrorm_async.record.opening import (
     NO_LABELS,
     EpisodeOpening,
@@ -27,7 +28,7 @@ from pycrorm_async.record.opening import (
     read_labels,
 )
 from pycrorm_async.record.recorded_before import StoredEpisodes
-from pycrorm_async.record.recorded_episode import OrderedCalls, RecordedEpisode
+from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.values import clean, clean_repr
 
 _TYPES_MAX = 10_000

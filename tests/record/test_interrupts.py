@@ -25,7 +25,7 @@ from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.queue import appender
 from pycrorm_async.queue import appender as gc_safe_lock
-from pycrorm_async.record import episode_writer, event_feed, plan_recorder, recorded_episode
+from pycrorm_async.record import episode_writer, event_feed, keyed_episode, plan_recorder, recorded_episode
 from pycrorm_async.record.plan_recorder import Recorder, current_episode
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.world.pose import Pose
@@ -235,7 +235,7 @@ def test_an_exit_at_any_call_leaves_the_plan(recorded: Recorded) -> None:
 @pytest.mark.slow
 @pytest.mark.every_python
 @pytest.mark.parametrize(
-    "module", [recorded_episode, episode_writer, event_feed, plan_recorder, gc_safe_lock, appender]
+    "module", [keyed_episode, recorded_episode, episode_writer, event_feed, plan_recorder, gc_safe_lock, appender]
 )
 def test_no_loop_is_directly_in_a_block_that_holds_a_lock(module: ModuleType) -> None:
     """Python 3.12 and 3.13 leave the block with the lock taken if a handler raises where a loop jumps back."""

@@ -293,11 +293,11 @@ async def test_a_process_killed_between_blob_and_record_loses_no_blob_that_an_ev
     database_url: str, tmp_path: Path, kill: str
 ) -> None:
     script = tmp_path / "observe.py"
-    put = "EpisodeWriter.put = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)" * (kill == "before the record")
+    put = "EpisodeEvents.put = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)" * (kill == "before the record")
     script.write_text(f"""
 import asyncio, os, signal
 from pycrorm_async import Blob, Memory
-from pycrorm_async.record.episode_writer import EpisodeWriter
+from pycrorm_async.record.episode_writer import EpisodeEvents
 
 async def main():
     async with Memory.open({database_url!r}, spool={str(tmp_path / "spool")!r}, writer="daemon") as memory:

@@ -25,7 +25,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.plan.failures import NavigationGoalInCollision
 from pycrorm_async.queue import recorder_queue
-from pycrorm_async.record import recorded_episode
+from pycrorm_async.record import keyed_episode
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.world.pose import Pose
@@ -273,7 +273,7 @@ def test_what_a_start_returned_names_its_node_long_after_its_end(tmp_path: Path)
 def test_nodes_that_start_below_ended_ones_do_not_keep_all_of_these(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorded_episode, "_ENDED_MAX", 3)
+    monkeypatch.setattr(keyed_episode, "_ENDED_MAX", 3)
     kept: list[int] = []
 
     def write(recording: Recording, episode: RecordedEpisode) -> None:
@@ -282,7 +282,7 @@ def test_nodes_that_start_below_ended_ones_do_not_keep_all_of_these(
             episode.start(key, step, parent=key - 1 if key else None)
             episode.end(key)
         everything = gc.get_objects()
-        kept.append(sum(type(each) is recorded_episode._Node and each.declared is step for each in everything))
+        kept.append(sum(type(each) is keyed_episode.Node and each.declared is step for each in everything))
 
     assert faults_of(tmp_path, write) == (0, None)
     assert kept == [3]

@@ -63,7 +63,7 @@ def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> Non
         "    kind = memory.recording.type('action', 'Step')\n"
         "    episode.start('a', kind)\n"
         "    recording = memory.recording\n"
-        "    with episode._calls._lock, recording._lock:\n"
+        "    with episode._writer._calls._lock, recording._lock:\n"
         "        child = os.fork()\n"
         "        if child == 0:\n"
         "            def work():\n"
