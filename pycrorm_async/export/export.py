@@ -29,21 +29,11 @@ from sqlalchemy import LargeBinary, Select
 from sqlalchemy import inspect as inspect_database
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.export import selection as selections
 from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written
 from pycrorm_async.export.lerobot import LEROBOT, ImageSize, check_size
 from pycrorm_async.export.neem import NEEM
 from pycrorm_async.export.scenes import MCAP, RERUN, Clock
-from pycrorm_async.export.selection import (
-    Exportable,
-    Manifest,
-    checksums,
-    covered_episodes,
-    episode_differences,
-    manifest_path,
-    read_manifest,
-    select_rows,
-    versions_of,
-)
 from pycrorm_async.export.traces import OTLP, TRACE
 from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
@@ -101,7 +91,7 @@ class Exported(NamedTuple):
     rows: int
     episodes: int
     left_out: int
-    manifest: Manifest
+    manifest: selections.Manifest
     unknown_name: str = ""
     unreadable: Mapping[int, str] = MappingProxyType({})
 
@@ -151,7 +141,7 @@ def format_named(name: str) -> Format:
 
 async def export(
     reading: Reading,
-    what: Exportable,
+    what: selections.Exportable,
     path: str | PathLike[str],
     *,
     file_format: FileFormat | None = None,
@@ -190,15 +180,17 @@ async def export(
     target = Path(path)
     _refuse_other_encodings(target)
     refuse_existing(target, force=force, folder=True)
-    refuse_existing(manifest_path(target), force=force)
+    refuse_existing(selections.manifest_path(target), force=force)
     name = file_format or format_of(target)
     chosen = format_named(name)
     options = _options(name, chosen, {"clock": clock, "fps": fps, "images": images, "no_formulas": no_formulas})
     is_of_rows, whole = chosen.holds == "rows", f"the format {name} holds whole episodes"
     if not is_of_rows and (episodes or isinstance(what, type | Select | Question)):
         raise CallerError(f"{whole}: name them by number, id or `last`")
-    with new_file(manifest_path(target), force=force) as description:
-        selection = await select_rows(reading, what, episodes, arguments=arguments, running=chosen.holds == "episode")
+    with new_file(selections.manifest_path(target), force=force) as description:
+        selection = await selections.select_rows(
+            reading, what, episodes, arguments=arguments, running=chosen.holds == "episode"
+        )
         if not is_of_rows and selection.kind != "episodes":
             raise CallerError(f"{whole}, and {selection.name} is a {selection.kind}")
         job = Job(reading, name, selection, options, report_progress)
@@ -206,7 +198,7 @@ async def export(
         with folder or new_file(target, force=force) as unnamed:
             written = await chosen.write(job, unnamed)
             log = await reading.log()
-            manifest = _manifest(job, chosen, written, log.log_id, checksums(unnamed, target.name))
+            manifest = _manifest(job, chosen, written, log.log_id, selections.checksums(unnamed, target.name))
             # Before the files get their names, so that a full disk leaves neither.
             description.write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
         unknown_name = ""
@@ -234,11 +226,11 @@ async def export_again(
 
     If episodes are missing, nothing is made and `differences` lists them. Raises what `export` raises.
     """
-    before = read_manifest(Path(manifest))
+    before = selections.read_manifest(Path(manifest))
     log = await reading.log()
     everything = {each.number: "" for each in await log.episodes()}
-    present = {each.id: each for each in await covered_episodes(reading, everything)}
-    differences = episode_differences(before.episodes, present)
+    present = {each.id: each for each in await selections.covered_episodes(reading, everything)}
+    differences = selections.episode_differences(before.episodes, present)
     if any(each.id not in present for each in before.episodes):
         return ExportComparison(same=False, differences=tuple(differences), exported=None)
     what, episodes = _named_by(before, statement)
@@ -278,8 +270,8 @@ def _refuse_other_encodings(path: Path) -> None:
 
 
 def _named_by(
-    manifest: Manifest, statement: Question | Select[*tuple[Any, ...]] | None
-) -> tuple[Exportable, tuple[str, ...]]:
+    manifest: selections.Manifest, statement: Question | Select[*tuple[Any, ...]] | None
+) -> tuple[selections.Exportable, tuple[str, ...]]:
     """Return the exportable that the manifest names, and the episodes to limit it to."""
     ids = tuple(each.id for each in manifest.episodes)
     match manifest.kind:
@@ -302,11 +294,11 @@ def _changes(subject: str, before: dict[str, str], now: dict[str, str]) -> list[
     return [f"{subject} {name}: {now.get(name, 'none')} instead of {before.get(name, 'none')}" for name in names]
 
 
-def _manifest(job: Job, format_: Format, written: Written, memory: str, files: dict[str, str]) -> Manifest:
+def _manifest(job: Job, format_: Format, written: Written, memory: str, files: dict[str, str]) -> selections.Manifest:
     selection = job.selection
     episodes = tuple(each for each in selection.episodes if each.number not in written.unreadable)
     arguments = {"arguments": dict(selection.arguments)} if selection.arguments else {}
-    return Manifest(
+    return selections.Manifest(
         kind=selection.kind,
         names=(selection.name,) if selection.name else tuple(each.id for each in episodes),
         file_format=job.file_format,
@@ -314,7 +306,7 @@ def _manifest(job: Job, format_: Format, written: Written, memory: str, files: d
         query=written.query,
         columns=dict(written.columns),
         rows=written.rows,
-        versions=versions_of(*format_.packages),
+        versions=selections.versions_of(*format_.packages),
         tables=PROJECTION_VERSION,
         memory=memory,
         episodes=episodes,

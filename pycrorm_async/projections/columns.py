@@ -19,15 +19,8 @@ import sqlalchemy as sa
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.types import TypeEngine
 
+from pycrorm_async.events import fields as event_fields
 from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
-from pycrorm_async.events.fields import (
-    bounded,
-    column_name,
-    fault_in_declaration,
-    fault_in_fields,
-    mapped_declaration,
-    table_name,
-)
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.store.dialect import Expected
 
@@ -248,7 +241,7 @@ class Layout(msgspec.Struct, frozen=True):
 
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
         """Return the layout with the table of this type. Raises `LayoutConflict` with the reason."""
-        fault = fault_in_declaration(declared)
+        fault = event_fields.fault_in_declaration(declared)
         if fault is not None:
             raise LayoutConflict(f"{declared.dtype[:80]}: {fault}")
         columns = {each.column: STORED_AS[each.type] for each in declared.fields if each.type in STORED_AS}
@@ -351,7 +344,7 @@ class Layout(msgspec.Struct, frozen=True):
 
     def _names(self, dtype: str, tables: tuple[str, ...]) -> list[str]:
         former = [old for old, present in self.renamed.items() if present == dtype]
-        return [dtype, *(table for table in reversed(tables) if table != table_name(dtype)), *former]
+        return [dtype, *(table for table in reversed(tables) if table != event_fields.table_name(dtype)), *former]
 
     def _bases(self, each: TypeTables) -> list[str]:
         """Return the bases of the same kind: a motion is never an action, even if its class derives from one."""
@@ -563,7 +556,7 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             refused[name] = layout.unmade[name]
             continue
         try:
-            declared = mapped_declaration(declaration_of(payload))
+            declared = event_fields.mapped_declaration(declaration_of(payload))
             try:
                 layout = layout.with_declaration(declared)
             except Contradiction as reason:
@@ -588,7 +581,7 @@ def _fit(
         ({}, []),
         ({"aliases": ()}, [f"{reason}; the alias is left out, so they stay two types"]),
         (
-            {"aliases": (), "dtype": dtype, "table": table_name(dtype)},
+            {"aliases": (), "dtype": dtype, "table": event_fields.table_name(dtype)},
             [f"{reason}; the {declared.kind} is kept as {dtype}"],
         ),
     )
@@ -612,13 +605,13 @@ def _with_other_fields(layout: Layout, declared: DesignatorTypeDeclared) -> tupl
         if field.slot in fields:
             continue
         name = f"{field.name}_{field.type}"
-        renamed = msgspec.structs.replace(field, name=name, column=column_name(name, field.type))
+        renamed = msgspec.structs.replace(field, name=name, column=event_fields.column_name(name, field.type))
         column, storage = columns[field.column.lower()]
         if column == field.column:
             line = f"{declared.dtype}.{column} is declared as {storage} and as {STORED_AS[field.type]}"
         else:
             line = f"{declared.dtype} is declared with the column {column} and with {field.column}"
-        if _fits(columns, renamed) and fault_in_fields([*fields.values(), renamed]) is None:
+        if _fits(columns, renamed) and event_fields.fault_in_fields([*fields.values(), renamed]) is None:
             fields[field.slot] = renamed
             adjustment.own_names[name] = field.name
             adjustment.lines.append(f"{line}; the {field.type} is kept as {name}")
@@ -668,9 +661,9 @@ def physical_name(table: str, generation: int) -> str:
     """
     prefix = _PREFIX if generation >= _FIRST_NUMBER else ""
     number = f"__{generation}"
-    return f"{prefix}{bounded(table, _NAME_LENGTH_MAX - len(prefix) - len(number))}{number}"
+    return f"{prefix}{event_fields.bounded(table, _NAME_LENGTH_MAX - len(prefix) - len(number))}{number}"
 
 
 def index_name(name: str, column: str, generation: int) -> str:
     """Return the name of the index on this column."""
-    return bounded(f"{physical_name(name, generation)}_by_{column}", _NAME_LENGTH_MAX)
+    return event_fields.bounded(f"{physical_name(name, generation)}_by_{column}", _NAME_LENGTH_MAX)

@@ -16,15 +16,8 @@ from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, Happening, ObjectAdded, references_in
 from pycrorm_async.projections import custom, custom_tables, findings, fold, pipeline
+from pycrorm_async.projections import generations as table_generations
 from pycrorm_async.projections.columns import OWN, Layout, unite
-from pycrorm_async.projections.generations import (
-    Generation,
-    current_generation,
-    failed_views,
-    projections_in,
-    read_generations,
-    unmade_types,
-)
 from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import STATUS, CannotFold, Designators, Rows
 from pycrorm_async.store import schema, stored
@@ -383,8 +376,8 @@ async def verify(
     with log.translated():
         if episode is None:
             await _check_database(log, result)
-            result.unmade = await unmade_types(log)
-            result.failed_views = await failed_views(log)
+            result.unmade = await table_generations.unmade_types(log)
+            result.failed_views = await table_generations.failed_views(log)
         result.stopped = await _stopped(log, episode)
         await check_outside(log, digests, result, episode)
         total = await _check_heads(log, within, result)
@@ -592,10 +585,10 @@ class _TablesCheck:
         self, connection: AsyncConnection, part: findings.EpisodeRange, episodes: Sequence[stored.EpisodeRow]
     ) -> bool:
         try:
-            generation = await current_generation(connection)
+            generation = await table_generations.current_generation(connection)
         except TablesOutdated as fault:  # check the log alone
             self._result.outdated = str(fault)
-            generation = Generation(0, 0, Layout(), {})
+            generation = table_generations.Generation(0, 0, Layout(), {})
         if generation is None:
             raise DatabaseUnavailable(no_tables(self._log.address))
         dialect = dialect_of(connection)
@@ -681,7 +674,7 @@ async def uncompared_projections(log: EventLog, projections: Sequence[custom.Pro
     """Return the projections of this memory that cannot be compared, by name, with the reasons."""
     by_name = {each.name: each for each in projections}
     async with log.snapshot() as connection:
-        generations = projections_in(await read_generations(connection))
+        generations = table_generations.projections_in(await table_generations.read_generations(connection))
         dialect = connection.dialect
     reasons: dict[str, str] = {}
     for name, each in generations.items():
@@ -714,7 +707,7 @@ class ProjectionCheck:
         self, connection: AsyncConnection, part: findings.EpisodeRange, _: Sequence[stored.EpisodeRow]
     ) -> bool:
         dialect, name = dialect_of(connection), self._projection.name
-        generation = projections_in(await read_generations(connection)).get(name)
+        generation = table_generations.projections_in(await table_generations.read_generations(connection)).get(name)
         self._comparison = None
         if generation is None or generation.version != self._projection.version:  # another program has rebuilt it
             return True

@@ -43,43 +43,12 @@ from threading import get_ident
 from typing import Final, NamedTuple
 from zlib import crc32
 
-from pycrorm_async import core
+from pycrorm_async import core, errors
 from pycrorm_async.clock import Clock
-from pycrorm_async.errors import (
-    CallerError,
-    EpisodeFull,
-    EpisodeRefused,
-    InternalError,
-    PycrormError,
-    SpoolFull,
-    SpoolStuck,
-    SpoolUnavailable,
-)
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, episode_text
-from pycrorm_async.queue.format import (
-    CHECKSUM_START,
-    COMMIT_BYTES,
-    DECLARATION,
-    EPISODE_ENDED,
-    EPISODE_STARTED,
-    EVENT,
-    HEADER_BYTES,
-    NO_EPISODE,
-    SEGMENT_BYTES_MAX,
-    TYPE_BYTES_MAX,
-    Frame,
-    LastRecord,
-    Segment,
-    SegmentHeader,
-    encode,
-    encode_body,
-    encode_commit,
-    encode_frame_header,
-    frame_bytes,
-    header_bytes,
-    salt_of,
-)
+from pycrorm_async.queue import format as spool_format
+from pycrorm_async.queue.format import frame_bytes
 from pycrorm_async.queue.gc_safe_lock import GcSafeLock, locked
 from pycrorm_async.settings import Settings
 
@@ -94,7 +63,7 @@ _TOUCHED_BYTES_MAX: Final = 2**18
 # === appender ===============================================================================================
 
 
-_ENDS: Final = frozenset({"NodeEnded", EPISODE_ENDED})
+_ENDS: Final = frozenset({"NodeEnded", spool_format.EPISODE_ENDED})
 """The events that an episode takes beyond `events_max`, so that it can be ended."""
 
 
@@ -117,7 +86,7 @@ class SyncSpan(NamedTuple):
     position: int
     records: int
     checksum: int
-    segments: tuple[Segment, ...]
+    segments: tuple[spool_format.Segment, ...]
 
 
 class Appender(core.Tail):
@@ -165,8 +134,8 @@ class Appender(core.Tail):
         self.blob_bytes = 0
         """Bytes of the blobs beside the segments, which share their limit."""
         self._disk_refused: str | None = None
-        self._sealed: list[Segment] = []
-        self._prepared: Segment | None = None
+        self._sealed: list[spool_format.Segment] = []
+        self._prepared: spool_format.Segment | None = None
         self._end = self._ordinary_end = capacity.end
         self._current = self._allocate(1)
         self._buffer, self._offset, self._salt = self._current.buffer, 0, 0
@@ -185,9 +154,9 @@ class Appender(core.Tail):
         """Append one event of any kind as `RecorderQueue.put_nowait` does, which tries `append` first."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
-        body = encode_body(name, payload)
+        body = spool_format.encode_body(name, payload)
         body_checksum = crc32(body)
-        kind, owner, sequence, last = EVENT, episode or NO_EPISODE, 0, None
+        kind, owner, sequence, last = spool_format.EVENT, episode or spool_format.NO_EPISODE, 0, None
         gc_lock, thread = self._gc_lock, get_ident()
         if self.owner == thread:
             raise gc_lock.reentered()
@@ -199,25 +168,25 @@ class Appender(core.Tail):
                 if self._refusal is not None:
                     raise self._refusal()
                 if episode is None:
-                    kind = DECLARATION
+                    kind = spool_format.DECLARATION
                     self._declare(body, name, version, payload)
                 elif (last := self.open.get(episode)) is not None:
                     sequence = last[0] + 1
                     if sequence > self._events_max and type_name not in _ENDS:
-                        raise EpisodeFull(_FULL_EPISODE.format(episode_text(episode), sequence - 1))
+                        raise errors.EpisodeFull(_FULL_EPISODE.format(episode_text(episode), sequence - 1))
                 else:
                     sequence = self._first_sequence(episode, type_name, after)
-                end = self._offset + HEADER_BYTES + len(body)
+                end = self._offset + spool_format.HEADER_BYTES + len(body)
                 if end > (self._end if reserved else self._ordinary_end):
-                    self._find_room(HEADER_BYTES + len(body), reserved=reserved)
-                    end = self._offset + HEADER_BYTES + len(body)
+                    self._find_room(spool_format.HEADER_BYTES + len(body), reserved=reserved)
+                    end = self._offset + spool_format.HEADER_BYTES + len(body)
                 offset = self._offset
                 position = self.position + 1
                 if at is None:
                     wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
                 else:
                     wall_ns, monotonic_ns = at[0], at[1] if last is None else max(at[1], last[2])
-                header = encode_frame_header(
+                header = spool_format.encode_frame_header(
                     kind,
                     len(name),
                     version,
@@ -230,19 +199,19 @@ class Appender(core.Tail):
                     self._salt,
                     body_checksum,
                 )
-                span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
+                span_checksum = crc32(header[spool_format.CHECKSUM_START :], self._span_checksum)
                 buffer = self._buffer
                 # No calls from here to the blank line, so that a KeyboardInterrupt cannot separate the record from
                 # the bookkeeping. The header comes last, because a body alone does not decode.
-                buffer[offset + HEADER_BYTES : end] = body
-                buffer[offset : offset + HEADER_BYTES] = header
+                buffer[offset + spool_format.HEADER_BYTES : end] = body
+                buffer[offset : offset + spool_format.HEADER_BYTES] = header
                 self._offset = end
                 self.position = position
                 self._span_count += 1
                 self._span_checksum = span_checksum
                 if episode is not None:
                     self.open[episode] = (sequence, wall_ns, monotonic_ns)
-                    if type_name == EPISODE_ENDED:
+                    if type_name == spool_format.EPISODE_ENDED:
                         del self.open[episode]
 
                 if self._quiet:
@@ -257,15 +226,17 @@ class Appender(core.Tail):
 
     def _first_sequence(self, episode: EpisodeId, type_name: str, after: int) -> int:
         """Return the sequence of the first event of an episode that is not open. Needs the lock."""
-        if type_name != EPISODE_STARTED and not after:
-            raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+        if type_name != spool_format.EPISODE_STARTED and not after:
+            raise errors.InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
         self._check_open_episodes()
         return after + 1
 
     def _check_open_episodes(self) -> None:
         """Refuse an episode if the list of open episodes in a header would leave no space for the largest record."""
         if not self._capacity.takes_episode(episodes=len(self.open), declared=self.declarations.bytes):
-            raise EpisodeRefused(f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)")
+            raise errors.EpisodeRefused(
+                f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)"
+            )
 
     def _declare(self, body: bytes, name: bytes, version: int, payload: bytes) -> None:
         """Repeat this declaration at the beginning of every later segment, if it fits."""
@@ -274,8 +245,8 @@ class Appender(core.Tail):
 
     def _encode_type(self, type_name: str) -> bytes:
         name = type_name.encode()
-        if not 0 < len(name) <= TYPE_BYTES_MAX:
-            raise InternalError(f"the name of an event type takes 1 to 255 bytes, not {len(name)}")
+        if not 0 < len(name) <= spool_format.TYPE_BYTES_MAX:
+            raise errors.InternalError(f"the name of an event type takes 1 to 255 bytes, not {len(name)}")
         self._type_names[type_name] = name
         return name
 
@@ -283,7 +254,7 @@ class Appender(core.Tail):
         """Make a frame of this size fit at `_offset`, in a new segment if necessary. Needs the lock."""
         largest = self._capacity.frame_bytes_max(episodes=len(self.open), declared=self.declarations.bytes)
         if frame_bytes > largest:
-            raise InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
+            raise errors.InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
         if not self._admits(frame_bytes, reserved=reserved):
             self._refused_bytes = max(self._refused_bytes, frame_bytes)
             raise self.full_error(self._disk_refused or "spool_bytes_max is reached")
@@ -302,12 +273,12 @@ class Appender(core.Tail):
             self._begin(segment)
         self._hurry()
 
-    def _begin(self, segment: Segment) -> None:
+    def _begin(self, segment: spool_format.Segment) -> None:
         """Make this segment the current one. Needs the lock."""
         base = self.position + 1
-        open_before = {episode: LastRecord(*last) for episode, last in self.open.items()}
-        offset = segment.begin(SegmentHeader(self._recorder, segment.number, base, open_before))
-        salt = salt_of(self._recorder, segment.number)
+        open_before = {episode: spool_format.LastRecord(*last) for episode, last in self.open.items()}
+        offset = segment.begin(spool_format.SegmentHeader(self._recorder, segment.number, base, open_before))
+        salt = spool_format.salt_of(self._recorder, segment.number)
         before = AppendState(offset, self.position, self._span_count, self._span_checksum)
         repeated = self.declarations.write(segment.buffer, before, salt=salt, clock=self._clock)
         begun = [*self.begun, SegmentStart(segment.number, base, segment.path)]
@@ -327,7 +298,7 @@ class Appender(core.Tail):
 
     def admits_again(self, *, reserved: bool) -> bool:
         """Return whether a record as large as the largest refused one would be accepted now."""
-        frame_bytes = max(self._refused_bytes, HEADER_BYTES)
+        frame_bytes = max(self._refused_bytes, spool_format.HEADER_BYTES)
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
         return self._admits_now(frame_bytes, reserved=reserved)
@@ -345,15 +316,15 @@ class Appender(core.Tail):
 
     @property
     @locked
-    def segments(self) -> tuple[Segment, ...]:
+    def segments(self) -> tuple[spool_format.Segment, ...]:
         """The mapped segments: full ones that no sync covers yet, and the current one."""
         return (*self._sealed, self._current)
 
-    def full_error(self, reason: str) -> PycrormError:
+    def full_error(self, reason: str) -> errors.PycrormError:
         """Return the error that a put into a full spool raises."""
         if self.stuck is None:
-            return SpoolFull(f"spool {self._folder} is full: {reason}")
-        return SpoolStuck(f"spool {self._folder} is full ({reason}) and cannot be emptied: {self.stuck}")
+            return errors.SpoolFull(f"spool {self._folder} is full: {reason}")
+        return errors.SpoolStuck(f"spool {self._folder} is full ({reason}) and cannot be emptied: {self.stuck}")
 
     @locked
     def _admits_now(self, frame_bytes: int, *, reserved: bool) -> bool:
@@ -388,7 +359,7 @@ class Appender(core.Tail):
         if size > 0 and self._refusal is not None:
             raise self._refusal()
         before, self.blob_bytes = self.blob_bytes, max(0, self.blob_bytes + size)
-        if size > 0 and not self._admits(HEADER_BYTES, reserved=False):
+        if size > 0 and not self._admits(spool_format.HEADER_BYTES, reserved=False):
             self.blob_bytes = before
             return False
         self._set_limits()
@@ -399,18 +370,18 @@ class Appender(core.Tail):
             spare=self._spare(), episodes=len(self.open), declared=self.declarations.bytes
         )
 
-    def _allocate(self, number: int) -> Segment:
+    def _allocate(self, number: int) -> spool_format.Segment:
         while True:
             try:
-                return Segment.allocate(self._folder, number=number, size=self._capacity.segment_bytes)
+                return spool_format.Segment.allocate(self._folder, number=number, size=self._capacity.segment_bytes)
             except OSError as error:
                 if error.errno not in FULL or not self._make_room(self._capacity.segment_bytes):
                     raise
 
-    def _allocation_refused(self, error: OSError) -> PycrormError:
+    def _allocation_refused(self, error: OSError) -> errors.PycrormError:
         reason = error.strerror or str(error)
         if error.errno not in OUT_OF_RESOURCES:
-            return SpoolUnavailable(self._folder, reason)
+            return errors.SpoolUnavailable(self._folder, reason)
         self._disk_refused = reason
         self._set_limits()
         self._hurry()  # the sync thread retries until the disk has space
@@ -427,9 +398,9 @@ class Appender(core.Tail):
         return span
 
     @locked
-    def append_commit(self, span: SyncSpan) -> Segment:
+    def append_commit(self, span: SyncSpan) -> spool_format.Segment:
         """Append the commit frame of a synced span; return the segment that holds it, which the caller must sync."""
-        frame = encode_commit(
+        frame = spool_format.encode_commit(
             position=span.position,
             count=span.records,
             checksum=span.checksum,
@@ -437,7 +408,7 @@ class Appender(core.Tail):
             monotonic_ns=self._monotonic_ns(),
             salt=self._salt,
         )
-        end = self._offset + COMMIT_BYTES
+        end = self._offset + spool_format.COMMIT_BYTES
         assert end <= self._capacity.segment_bytes, "space for commit frames is reserved"
         self._buffer[self._offset : end] = frame
         self._offset = end
@@ -459,7 +430,7 @@ class Appender(core.Tail):
             segment.close()
 
     @locked
-    def _complete(self, span: SyncSpan) -> list[Segment]:
+    def _complete(self, span: SyncSpan) -> list[spool_format.Segment]:
         done = [segment for segment in self._sealed if segment in span.segments[:-1]]
         self._sealed = [segment for segment in self._sealed if segment not in done]
         return done
@@ -516,7 +487,7 @@ class Appender(core.Tail):
     # --- ending ------------------------------------------------------------------------------------------------
 
     @locked
-    def refuse(self, refusal: Callable[[], PycrormError]) -> None:
+    def refuse(self, refusal: Callable[[], errors.PycrormError]) -> None:
         """Refuse every record from now on; the first refusal stays."""
         self._refusal = self._refusal or refusal
 
@@ -528,7 +499,7 @@ class Appender(core.Tail):
             if segment is not None:
                 segment.close()
 
-    def abandon(self, refusal: Callable[[], PycrormError]) -> None:
+    def abandon(self, refusal: Callable[[], errors.PycrormError]) -> None:
         """Detach in a forked child: replace the locks, whose holders may be threads that the child does not have."""
         self._gc_lock.abandon()
         self.owner = 0
@@ -544,7 +515,7 @@ class Appender(core.Tail):
 # Space is assigned in whole segments, so the files never exceed `spool_bytes_max`. Each segment reserves space for two
 # commit frames at its end: that of a sync that began before the last record, and that of the sync that covers it.
 
-_COMMITS_BYTES = 2 * COMMIT_BYTES
+_COMMITS_BYTES = 2 * spool_format.COMMIT_BYTES
 _EPISODES_MIN = 16
 """Open episodes that every segment's header has space for beside the largest record."""
 
@@ -573,16 +544,22 @@ class Capacity(NamedTuple):
     def of(cls, settings: Settings) -> Capacity:
         """Derive the limits. Raises `CallerError` for settings that could block the queue for ever or lose a record."""
         if settings.spool_bytes_max - settings.spool_reserve_bytes < 3 * settings.segment_bytes:
-            raise CallerError(
+            raise errors.CallerError(
                 f"spool_bytes_max ({settings.spool_bytes_max:,}) must hold the reserve"
                 f" ({settings.spool_reserve_bytes:,}) and three segments ({settings.segment_bytes:,} each)"
             )
-        if settings.segment_bytes > SEGMENT_BYTES_MAX:
-            raise CallerError(f"segment_bytes ({settings.segment_bytes:,}) must be at most {SEGMENT_BYTES_MAX:,}")
-        needed = header_bytes(_EPISODES_MIN) + frame_bytes(TYPE_BYTES_MAX, settings.record_bytes_max) + _COMMITS_BYTES
+        if settings.segment_bytes > spool_format.SEGMENT_BYTES_MAX:
+            raise errors.CallerError(
+                f"segment_bytes ({settings.segment_bytes:,}) must be at most {spool_format.SEGMENT_BYTES_MAX:,}"
+            )
+        needed = (
+            spool_format.header_bytes(_EPISODES_MIN)
+            + frame_bytes(spool_format.TYPE_BYTES_MAX, settings.record_bytes_max)
+            + _COMMITS_BYTES
+        )
         left = settings.segment_bytes - needed
         if left < 0:
-            raise CallerError(
+            raise errors.CallerError(
                 f"segment_bytes ({settings.segment_bytes:,}) must hold a record of record_bytes_max"
                 f" ({settings.record_bytes_max:,}) and {_EPISODES_MIN} open episodes: {needed:,} at least"
             )
@@ -590,7 +567,7 @@ class Capacity(NamedTuple):
             settings.segment_bytes,
             settings.spool_bytes_max // settings.segment_bytes,
             settings.spool_reserve_bytes,
-            _EPISODES_MIN + left // (header_bytes(1) - header_bytes(0)),
+            _EPISODES_MIN + left // (spool_format.header_bytes(1) - spool_format.header_bytes(0)),
             settings.episode_events_max - min(settings.episode_events_max // 8, _ENDS_MAX),
         )
 
@@ -609,15 +586,19 @@ class Capacity(NamedTuple):
 
         Behind the declarations and the open episodes, at least sixteen, the largest record must still fit.
         """
-        return header_bytes(self.episodes_max) - header_bytes(max(episodes, _EPISODES_MIN)) - declared
+        return (
+            spool_format.header_bytes(self.episodes_max)
+            - spool_format.header_bytes(max(episodes, _EPISODES_MIN))
+            - declared
+        )
 
     def takes_episode(self, *, episodes: int, declared: int) -> bool:
         """Return whether one more episode may be open."""
-        return header_bytes(episodes + 1) + declared <= header_bytes(self.episodes_max)
+        return spool_format.header_bytes(episodes + 1) + declared <= spool_format.header_bytes(self.episodes_max)
 
     def frame_bytes_max(self, *, episodes: int, declared: int = 0) -> int:
         """Return the largest frame that fits into a segment behind its header and declarations."""
-        return self.end - header_bytes(episodes) - declared
+        return self.end - spool_format.header_bytes(episodes) - declared
 
     def ordinary_end(self, *, spare: int, episodes: int, declared: int = 0) -> int:
         """Return the offset at which ordinary records of the current segment must end to keep the reserve free."""
@@ -669,14 +650,14 @@ class RepeatedDeclarations:
     def __init__(self, descriptions_bytes_max: int) -> None:
         self.bytes = 0
         self.unrepeated = 0
-        self._frames: dict[bytes, Frame] = {}
+        self._frames: dict[bytes, spool_format.Frame] = {}
         self._descriptions_bytes_max = descriptions_bytes_max
         self._descriptions: dict[bytes, int] = {}
         self._descriptions_bytes = 0
 
     def add(self, body: bytes, *, name: bytes, version: int, payload: bytes, room: int) -> None:
         """Add a declaration. Does not repeat one larger than `room` bytes, and drops the oldest descriptions."""
-        size = HEADER_BYTES + len(body)
+        size = spool_format.HEADER_BYTES + len(body)
         if body in self._frames:
             if body in self._descriptions:  # the latest ones are kept
                 self._descriptions[body] = self._descriptions.pop(body)
@@ -686,7 +667,9 @@ class RepeatedDeclarations:
         if size > room:
             self.unrepeated += 1
             return
-        self._frames[body] = Frame(DECLARATION, version, 0, 0, 0, 0, NO_EPISODE, name, payload)
+        self._frames[body] = spool_format.Frame(
+            spool_format.DECLARATION, version, 0, 0, 0, 0, spool_format.NO_EPISODE, name, payload
+        )
         self.bytes += size
         if name == _DESCRIPTION:
             self._descriptions[body] = size
@@ -707,8 +690,8 @@ class RepeatedDeclarations:
             position += 1
             records += 1
             frame = frame._replace(position=position, wall_ns=clock.wall_ns(), monotonic_ns=clock.monotonic_ns())
-            encoded = encode(frame, salt)
+            encoded = spool_format.encode(frame, salt)
             buffer[offset : offset + len(encoded)] = encoded
             offset += len(encoded)
-            checksum = crc32(encoded[CHECKSUM_START:HEADER_BYTES], checksum)
+            checksum = crc32(encoded[spool_format.CHECKSUM_START : spool_format.HEADER_BYTES], checksum)
         return AppendState(offset, position, records, checksum)

@@ -15,30 +15,10 @@ from typing import Final, TypeAlias
 from pycrorm_async.errors import InternalError, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue import format as spool_format
+from pycrorm_async.queue import scan
+from pycrorm_async.queue import spool as spools
 from pycrorm_async.queue.blobs import blob_bytes, blob_files
 from pycrorm_async.queue.locks import ALIVE, BLOBS, DRAIN, MAKING, MENDED, PROGRESS, TAIL, FileLock, is_locked
-from pycrorm_async.queue.scan import (
-    SegmentScanner,
-    Survey,
-    ValidPrefix,
-    check_record,
-    scan,
-    survey,
-    tails,
-    whole_frames,
-)
-from pycrorm_async.queue.spool import (
-    DrainStatus,
-    Progress,
-    RecorderFolder,
-    RecorderStatus,
-    Spool,
-    folder_error,
-    is_folder_name,
-    parse_folder_name,
-    wrap_os_errors,
-    write_durably,
-)
 
 # === inspection ===============================================================================================
 #
@@ -112,8 +92,8 @@ class RecorderReport:
     alive: bool
     being_drained: bool = False
     bytes_spooled: int = 0
-    recorded: RecorderStatus | None = None
-    drained: DrainStatus | None = None
+    recorded: spools.RecorderStatus | None = None
+    drained: spools.DrainStatus | None = None
     refused: str | None = None
     blobs: int = 0
     first: int = 1
@@ -156,8 +136,8 @@ class SpoolReport:
 
 def inspect_spool(path: Path) -> SpoolReport:
     """Report the content of a spool. Raises `SpoolUnavailable` if it is missing, unreadable or not a spool."""
-    spool = Spool(path)
-    with wrap_os_errors(path):
+    spool = spools.Spool(path)
+    with spools.wrap_os_errors(path):
         if not path.exists():
             raise SpoolUnavailable(path, "does not exist; `pycrorm status --url URL` prints the spool of a database")
     recorders, log_id = spool.recorders(), spool.log_id()
@@ -186,32 +166,32 @@ def _text(name: str) -> str:
 def is_damaged_copy(path: Path) -> bool:
     """Return whether this is a damaged folder that `repair` replaced."""
     name, suffix, number = path.name.partition(DAMAGED_SUFFIX)
-    return is_folder_name(name) and bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
+    return spools.is_folder_name(name) and bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
 
 
 def _is_unfinished(path: Path) -> bool:
     """Return whether this is an empty recorder's folder without `alive`, or one that has its unfinished name."""
     name = path.name.removesuffix(MENDED).removesuffix(MAKING)
-    if not is_folder_name(name) or not path.is_dir():
+    if not spools.is_folder_name(name) or not path.is_dir():
         return False
     return name != path.name or not any(path.iterdir())
 
 
-def inspect_recorder(recorder: RecorderFolder, *, scanning: bool = True) -> RecorderReport:
+def inspect_recorder(recorder: spools.RecorderFolder, *, scanning: bool = True) -> RecorderReport:
     """Report one recorder's folder, with the content of its segments if `scanning`.
 
     An error that prevents it is in `refused`.
     """
     report = RecorderReport(recorder.name, str(recorder.path), recorder.alive)
     try:
-        with wrap_os_errors(recorder.path):
+        with spools.wrap_os_errors(recorder.path):
             report = _look(recorder, report)
             return _examine(recorder, report) if scanning else report
     except Exception as error:  # noqa: BLE001 - reported; must not prevent the report on the others
-        return replace(report, refused=str(folder_error(recorder.path, error)))
+        return replace(report, refused=str(spools.folder_error(recorder.path, error)))
 
 
-def _look(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport:
+def _look(recorder: spools.RecorderFolder, report: RecorderReport) -> RecorderReport:
     blobs = blob_files(recorder.path)
     report = replace(
         report,
@@ -219,7 +199,7 @@ def _look(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport:
         bytes_spooled=_bytes(recorder.path) + blob_bytes(blobs),
         blobs=len(blobs),
     )
-    progress = Progress.open(recorder.path, writing=False) if recorder.alive else None
+    progress = spools.Progress.open(recorder.path, writing=False) if recorder.alive else None
     if progress is None:
         return report
     try:
@@ -262,7 +242,7 @@ class _Count:
             self.episodes.add(frame.episode)
 
 
-def _examine(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport:
+def _examine(recorder: spools.RecorderFolder, report: RecorderReport) -> RecorderReport:
     folder = recorder.path
     counted, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or report.being_drained)
     entries = [each.name for each in folder.iterdir()]
@@ -285,20 +265,20 @@ def _examine(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport
             OpenEpisode(episode_text(episode), last.sequence, last.wall_ns)
             for episode, last in sorted(prefix.open.items())
         ),
-        tail_bytes=0 if recorder.alive or damage else sum(len(tail) for _, tail in tails(folder, prefix)),
+        tail_bytes=0 if recorder.alive or damage else sum(len(tail) for _, tail in scan.tails(folder, prefix)),
         cut_off=tuple(each for each in others if each.endswith(TAIL)),
         foreign=tuple(each for each in others if not each.endswith((TAIL, MAKING))),
         damage=None if damage is None else FileDamage(str(damage.path), damage.offset, damage.reason),
     )
 
 
-def _survey_stable(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
+def _survey_stable(folder: Path, *, changing: bool) -> tuple[_Count, scan.Survey]:
     """Scan a folder; repeat the scan of a changing one until it meets no damage, or the same damage again."""
     met: set[tuple[Path, int]] = set()
     for attempt in range(_SURVEYS):
         count = _Count()
         try:
-            result = survey(folder, parse_folder_name(folder.name).recorder, on_frame=count.count_frame)
+            result = scan.survey(folder, spools.parse_folder_name(folder.name).recorder, on_frame=count.count_frame)
         except FileNotFoundError:  # stored and deleted between the listing and the reading
             if not changing or attempt == _SURVEYS - 1:
                 raise
@@ -331,16 +311,16 @@ class _Salvage:
     decodes, `dropped` the whole records behind a gap in their episode.
     """
 
-    def __init__(self, folder: Path, prefix: ValidPrefix) -> None:
+    def __init__(self, folder: Path, prefix: scan.ValidPrefix) -> None:
         self._folder = folder
-        self._recorder = parse_folder_name(folder.name).recorder
+        self._recorder = spools.parse_folder_name(folder.name).recorder
         self._first = prefix.cut.number or min(prefix.numbers)
         self._numbers = [each for each in prefix.numbers if each >= self._first]
         self.headless = not prefix.bases and self._first > 1
         self.unreadable: list[Range] = []
         self.dropped: dict[EpisodeId, list[spool_format.Frame]] = {}
         earlier = {each: spool_format.segment_path(folder, each) for each in prefix.bases if each < self._first}
-        before = SegmentScanner(folder, self._recorder, segments=earlier)
+        before = scan.SegmentScanner(folder, self._recorder, segments=earlier)
         while before.step():
             pass
         self._open, self.position = dict(before.prefix.open), before.prefix.cut.position
@@ -370,7 +350,7 @@ class _Salvage:
                 )
                 salt = spool_format.salt_of(self._recorder, number)
                 span = spool_format.encode_span(kept, after=after, salt=salt, uncommitted=self._uncommitted)
-                write_durably(spool_format.segment_path(self._folder, number), b"".join((header, *span)))
+                spools.write_durably(spool_format.segment_path(self._folder, number), b"".join((header, *span)))
                 self._uncommitted = ()
                 number += 1
             self.position += len(kept)
@@ -388,12 +368,12 @@ class _Salvage:
     def _frames(self, number: int) -> Iterator[spool_format.Frame]:
         """Decode the whole frames of a segment that a recorder can have written."""
         path = spool_format.segment_path(self._folder, number)
-        for offset, frame in whole_frames(
+        for offset, frame in scan.whole_frames(
             spool_format.read_segment(path), spool_format.header_bytes(0), spool_format.salt_of(self._recorder, number)
         ):
             if frame.kind != spool_format.COMMIT:
                 try:
-                    check_record(path, offset, frame)
+                    scan.check_record(path, offset, frame)
                 except SpoolDamaged:  # the gap it leaves is reported
                     continue
             yield frame
@@ -495,7 +475,7 @@ def repair_folder(folder: Path) -> RepairReport | None:
     Raises `SpoolUnavailable` if the recorder lives, a process drains the folder, or it cannot be written, and
     `SpoolForeign` for a newer format or another recorder's file. Then the folder is unchanged.
     """
-    with wrap_os_errors(folder), ExitStack() as locks:
+    with spools.wrap_os_errors(folder), ExitStack() as locks:
         for name, holder in (
             (ALIVE, "its recorder is alive, or another process drains it"),
             (DRAIN, "another process drains it"),
@@ -504,14 +484,14 @@ def repair_folder(folder: Path) -> RepairReport | None:
             if lock is None:
                 raise SpoolUnavailable(folder, f"{holder}: stop that process first")
             locks.callback(lock.release)
-        recorder = parse_folder_name(folder.name).recorder
-        prefix, damage, _ = survey(folder, recorder)
+        recorder = spools.parse_folder_name(folder.name).recorder
+        prefix, damage, _ = scan.survey(folder, recorder)
         if damage is None:
             return None
         aside = _copy_aside(folder)
         salvage = _Salvage(folder, prefix)
         salvage.run()
-        written = scan(folder, recorder).cut.position
+        written = scan.scan(folder, recorder).cut.position
         if written != salvage.position:
             raise InternalError(f"{folder} holds records up to {written} instead of {salvage.position}; see {aside}")
     return RepairReport(
@@ -555,7 +535,7 @@ def _link(source: str, target: str) -> None:
 def finish_repairs(spool: Path) -> list[Path]:
     """Name the finished folders of repairs by an earlier version that were killed in their last step; return them."""
     folders = []
-    with wrap_os_errors(spool):
+    with spools.wrap_os_errors(spool):
         for repaired in sorted(spool.glob(f"*{MENDED}")):
             folder = repaired.with_name(repaired.name.removesuffix(MENDED))
             if not folder.exists():  # the damaged folder was renamed only after the new one was whole and synced

@@ -38,21 +38,12 @@ from pycrorm_async import core, errors
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue import spool as spools
 from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.blobs import LiveBlobs
 from pycrorm_async.queue.format import ReadBatch, ReadCursor, Reader, ReadPlace, Segment, header_bytes
 from pycrorm_async.queue.locks import ALIVE, DRAIN, FileIdentity, FileLock, call_in_forked_child, is_locked
 from pycrorm_async.queue.sources import DeadLetters
-from pycrorm_async.queue.spool import (
-    DrainStatus,
-    Progress,
-    RecorderStatus,
-    Spool,
-    make_folder,
-    remove_folder,
-    remove_made_ahead,
-    wrap_os_errors,
-)
 from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.queue.sync_thread import Notifier, SyncThread
 from pycrorm_async.settings import Settings
@@ -104,7 +95,7 @@ class RecorderQueue:
         self._sync_interval_s = settings.sync_interval_ms / 1000
         self._stored_segments = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
         self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
-        with wrap_os_errors(folder):
+        with spools.wrap_os_errors(folder):
             self._appender = Appender(
                 folder=folder,
                 recorder=recorder,
@@ -117,7 +108,7 @@ class RecorderQueue:
             self._append: Final = self._appender.append
             if self._appender.prepare():
                 self._sync_thread.call_in(PROGRESS_INTERVAL_S)
-            self._progress = Progress.make(folder) if offered else None
+            self._progress = spools.Progress.make(folder) if offered else None
             self._identity = FileIdentity.of(folder.stat())
         self._blobs = LiveBlobs(folder, reserve=self._appender.reserve_blob, make_room=self._stored_segments.make_room)
         self._source = OwnSource(self, self._notifier, ReadPlace(folder, recorder, ReadCursor(1, header_bytes(0), 0)))
@@ -135,12 +126,12 @@ class RecorderQueue:
         """
         Capacity.of(settings)  # raises for contradictory settings before anything is created
         _note_core()
-        folder, alive = make_folder(spool, episode_text(recorder), settings.file_access)
+        folder, alive = spools.make_folder(spool, episode_text(recorder), settings.file_access)
         try:
             return cls(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
         except BaseException:
             with contextlib.suppress(OSError):
-                remove_folder(folder)
+                spools.remove_folder(folder)
             alive.release()
             raise
 
@@ -186,7 +177,7 @@ class RecorderQueue:
         Raises `SpoolFull` without waiting if it does not fit, `SpoolClosed` as `put_nowait` does, and
         `SpoolUnavailable` if the disk refuses it.
         """
-        with wrap_os_errors(self.folder):
+        with spools.wrap_os_errors(self.folder):
             return self._blobs.put(content)
 
     def release_blob(self, name: str) -> None:
@@ -281,13 +272,13 @@ class RecorderQueue:
         return self._stored if status is None else max(self._stored, status.stored)
 
     @property
-    def external_drain_status(self) -> DrainStatus | None:
+    def external_drain_status(self) -> spools.DrainStatus | None:
         """The drain status from another process, if plausible; None if this process drains the queue."""
         if self._progress is None:
             return None
         status = self._progress.drained()
         # No drainer can have a position beyond `_synced`.
-        return DrainStatus() if max(status.stored, status.folded) > self._synced else status
+        return spools.DrainStatus() if max(status.stored, status.folded) > self._synced else status
 
     def ends_at(self, position: int) -> bool:
         """Return whether no record will follow this position."""
@@ -300,7 +291,7 @@ class RecorderQueue:
     @property
     def is_drained(self) -> bool:
         """True if a task of this process or another process is draining the queue now."""
-        with wrap_os_errors(self.folder):
+        with spools.wrap_os_errors(self.folder):
             return self._source.drains or is_locked(self.folder / DRAIN)
 
     @property
@@ -360,7 +351,7 @@ class RecorderQueue:
         assert position <= self._source.reader.cursor.position, "only supplied records can be acknowledged"
         if self._log_id is None:
             with contextlib.suppress(errors.FilesError):
-                self._log_id = Spool(self.folder.parent).log_id()
+                self._log_id = spools.Spool(self.folder.parent).log_id()
         self._stored = max(self._stored, position)
         if self._trimmable():
             self._sync_thread.hurry()
@@ -412,10 +403,10 @@ class RecorderQueue:
         try:
             all_stored = self._failure is None and self.stored == self.written and not self._appender.open
             if all_stored and self._identity.is_at(self.folder):
-                with wrap_os_errors(self.folder):
-                    remove_made_ahead(self.folder)
+                with spools.wrap_os_errors(self.folder):
+                    spools.remove_made_ahead(self.folder)
                     self._keep_last_segments()
-                    remove_folder(self.folder)
+                    spools.remove_folder(self.folder)
         finally:
             if self._progress is not None:
                 self._progress.close()
@@ -507,7 +498,7 @@ class RecorderQueue:
         if self._progress is not None:
             try:
                 is_last = self._closed and self._synced == self.written
-                self._progress.write_recorder_status(RecorderStatus(self._synced, is_last))
+                self._progress.write_recorder_status(spools.RecorderStatus(self._synced, is_last))
             except OSError:  # must not refuse the plan's events
                 return False
         return True
@@ -604,13 +595,13 @@ class OwnSource:
         return self._queue.synced > position or self._queue.ends_at(position)
 
     def _read(self, partial_batch: ReadBatch | None, events_max: int, bytes_max: int) -> ReadBatch:
-        with wrap_os_errors(self._queue.folder):
+        with spools.wrap_os_errors(self._queue.folder):
             last = self._queue.synced
             return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=partial_batch)
 
     def _take_drain(self) -> None:
         if self._drain is None and not self._released:
-            with wrap_os_errors(self._queue.folder):
+            with spools.wrap_os_errors(self._queue.folder):
                 self._drain = FileLock.take(self._queue.folder / DRAIN)
             if self._drain is None:
                 raise errors.SpoolUnavailable(self._queue.folder, "is being drained by another process")

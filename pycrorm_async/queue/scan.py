@@ -31,40 +31,13 @@ from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_named
 from pycrorm_async.events.types import references_in
+from pycrorm_async.queue import format as spool_format
 from pycrorm_async.queue.blobs import is_whole
-from pycrorm_async.queue.format import (
-    CHECKSUM,
-    COMMIT,
-    EPISODE_ENDED,
-    EVENT,
-    FORMAT,
-    HEADER_BYTES,
-    RECORDS_AT_ONCE,
-    SEGMENT_BYTES_MAX,
-    Buffer,
-    Fields,
-    Frame,
-    LastRecord,
-    ReadCursor,
-    SegmentHeader,
-    check_type,
-    decode,
-    decode_each,
-    decode_header,
-    format_of,
-    header_bytes,
-    read_segment,
-    salt_of,
-    segment_numbers,
-    segment_path,
-    span_checksum,
-    sync_folder,
-)
 from pycrorm_async.queue.locks import TAIL
 from pycrorm_async.queue.spool import write_durably
 
-_SALT_OFFSET = HEADER_BYTES - 8
-_EPISODE_ENDED = EPISODE_ENDED.encode()
+_SALT_OFFSET = spool_format.HEADER_BYTES - 8
+_EPISODE_ENDED = spool_format.EPISODE_ENDED.encode()
 
 
 class ValidPrefix(NamedTuple):
@@ -78,10 +51,10 @@ class ValidPrefix(NamedTuple):
         numbers: numbers of all segment files, including those behind the cut.
     """
 
-    start: ReadCursor
-    cut: ReadCursor
+    start: spool_format.ReadCursor
+    cut: spool_format.ReadCursor
     bases: dict[int, int]
-    open: dict[EpisodeId, LastRecord]
+    open: dict[EpisodeId, spool_format.LastRecord]
     numbers: list[int]
 
 
@@ -111,7 +84,12 @@ def scan(folder: Path, recorder: bytes) -> ValidPrefix:
     return prefix
 
 
-def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[ReadCursor, Frame], None] | None = None) -> Survey:
+def survey(
+    folder: Path,
+    recorder: bytes,
+    *,
+    on_frame: Callable[[spool_format.ReadCursor, spool_format.Frame], None] | None = None,
+) -> Survey:
     """Scan as `scan` does, and return damage. Calls `on_frame` with each kept frame and the cursor behind it."""
     scanner = SegmentScanner(folder, recorder, on_frame=on_frame)
     damage: SpoolDamaged | None = None
@@ -135,7 +113,7 @@ class SegmentScanner:
         folder: Path,
         recorder: bytes,
         *,
-        on_frame: Callable[[ReadCursor, Frame], None] | None = None,
+        on_frame: Callable[[spool_format.ReadCursor, spool_format.Frame], None] | None = None,
         records: list[Record] | None = None,
         segments: Mapping[int, Path] | None = None,
     ) -> None:
@@ -145,9 +123,9 @@ class SegmentScanner:
         self._records = records
         self._types: dict[bytes, str] = {}
         self._paths = segments
-        self._numbers = segment_numbers(folder) if segments is None else sorted(segments)
+        self._numbers = spool_format.segment_numbers(folder) if segments is None else sorted(segments)
         self._steps = 0
-        self._start = self._cut = ReadCursor(0, 0, 0)
+        self._start = self._cut = spool_format.ReadCursor(0, 0, 0)
         self._bases: dict[int, int] = {}
         self._open: dict[bytes, tuple[int, int, int]] = {}
         self._uncommitted: list[int] = []  # checksums of the records that no commit frame has covered yet
@@ -175,7 +153,7 @@ class SegmentScanner:
         except (PycrormError, OSError):
             raise
         except Exception as error:  # an unforeseen content must fail this folder alone, as damage
-            path = segment_path(self._folder, self._cut.number)
+            path = spool_format.segment_path(self._folder, self._cut.number)
             self.damage = SpoolDamaged(path, self._cut.offset, f"{type(error).__name__}: {error}")
             raise self.damage from error
         self.finished = True
@@ -184,7 +162,7 @@ class SegmentScanner:
     @property
     def prefix(self) -> ValidPrefix:
         """The records scanned so far."""
-        opened = {EpisodeId(episode): LastRecord(*last) for episode, last in self._open.items()}
+        opened = {EpisodeId(episode): spool_format.LastRecord(*last) for episode, last in self._open.items()}
         return ValidPrefix(self._start, self._cut, self._bases, opened, self._numbers)
 
     @property
@@ -198,41 +176,41 @@ class SegmentScanner:
 
     def _scan_segment(self, number: int) -> bool:
         """Scan one segment; False if it does not continue the one before."""
-        path = segment_path(self._folder, number) if self._paths is None else self._paths[number]
-        buffer = read_segment(path)
+        path = spool_format.segment_path(self._folder, number) if self._paths is None else self._paths[number]
+        buffer = spool_format.read_segment(path)
         header = read_header(path, buffer, recorder=self._recorder, number=number)
         if not self._bases:
             if header is None and number > 1:
                 raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are deleted")
             base = 1 if header is None else header.base
-            self._start = self._cut = ReadCursor(number, header_bytes(0), base - 1)
+            self._start = self._cut = spool_format.ReadCursor(number, spool_format.header_bytes(0), base - 1)
         if header is None or number != self._cut.number + bool(self._bases) or header.base != self._cut.position + 1:
             return False
-        first = header_bytes(len(header.open))
+        first = spool_format.header_bytes(len(header.open))
         if not self._bases:
-            self._start = ReadCursor(number, first, header.base - 1)
+            self._start = spool_format.ReadCursor(number, first, header.base - 1)
             self._open = dict(header.open.items())
         self._bases[number] = header.base
-        self._cut = ReadCursor(number, first, header.base - 1)
+        self._cut = spool_format.ReadCursor(number, first, header.base - 1)
         self._scan_records(path, buffer, number)
         return True
 
-    def _scan_records(self, path: Path, buffer: Buffer, number: int) -> None:
+    def _scan_records(self, path: Path, buffer: spool_format.Buffer, number: int) -> None:
         """Keep a segment's records from the cut to the first hole or damage, and move the cut there."""
         _, offset, position = self._cut
-        salt = salt_of(self._recorder, number)
+        salt = spool_format.salt_of(self._recorder, number)
         in_steps = core.IS_COMPILED and self._on_frame is None
         try:
             while True:
                 if in_steps:
-                    until = position + RECORDS_AT_ONCE
+                    until = position + spool_format.RECORDS_AT_ONCE
                     offset, position = self._take(buffer, offset, salt, position, until)
                     if position == until:
                         continue
-                for frame in decode_each(buffer, offset, salt):
-                    if frame[0] == COMMIT:
-                        self._cut = ReadCursor(number, offset, position)
-                        self._check_commit(path, make(Frame, frame))
+                for frame in spool_format.decode_each(buffer, offset, salt):
+                    if frame[0] == spool_format.COMMIT:
+                        self._cut = spool_format.ReadCursor(number, offset, position)
+                        self._check_commit(path, make(spool_format.Frame, frame))
                     elif frame[2] == position + 1:
                         self._keep(path, offset, frame)
                         position += 1
@@ -240,28 +218,30 @@ class SegmentScanner:
                         return
                     offset += frame[-1]
                     if self._on_frame is not None:
-                        self._on_frame(ReadCursor(number, offset, position), make(Frame, frame))
+                        self._on_frame(
+                            spool_format.ReadCursor(number, offset, position), make(spool_format.Frame, frame)
+                        )
                     if in_steps:
                         break
                 else:
                     return
         finally:
-            self._cut = ReadCursor(number, offset, position)
+            self._cut = spool_format.ReadCursor(number, offset, position)
 
-    def _take(self, buffer: Buffer, offset: int, salt: int, position: int, until: int) -> tuple[int, int]:
+    def _take(self, buffer: spool_format.Buffer, offset: int, salt: int, position: int, until: int) -> tuple[int, int]:
         """Keep the records that need no decision; return offset and position behind them."""
-        limits = (position, until, 0, SEGMENT_BYTES_MAX)
+        limits = (position, until, 0, spool_format.SEGMENT_BYTES_MAX)
         kept = (self._types, Record, self._records, self._open, self._uncommitted)
         offset, position, _ = core.take_records(buffer, offset, salt, *limits, *kept)
         return offset, position
 
-    def _keep(self, path: Path, offset: int, frame: Fields) -> None:
+    def _keep(self, path: Path, offset: int, frame: spool_format.Fields) -> None:
         """Keep the next record. Raises `SpoolDamaged` if no recorder writes it."""
         kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, checksum, _ = frame
         type_name = self._types.get(name)
         if type_name is None:
-            type_name = self._types[name] = check_type(path, offset, name)
-        if kind == EVENT:
+            type_name = self._types[name] = spool_format.check_type(path, offset, name)
+        if kind == spool_format.EVENT:
             before = self._open.get(episode)
             if sequence != (before[0] if before else 0) + 1 and (before or not is_named(episode)):
                 raise _not_next(path, offset, episode, sequence, before)
@@ -272,18 +252,20 @@ class SegmentScanner:
             _check_declaration(path, offset, type_name, payload)
         self._uncommitted.append(checksum)
         if self._records is not None:
-            owner = episode if kind == EVENT else None
+            owner = episode if kind == spool_format.EVENT else None
             values = (at, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
             self._records.append(make(Record, values))
 
-    def _check_commit(self, path: Path, frame: Frame) -> None:
+    def _check_commit(self, path: Path, frame: spool_format.Frame) -> None:
         """Check that the records a commit frame covers are present and unchanged."""
         later = self._cut.position - frame.position
         if later < 0:
             raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was synced and is missing")
         covered = self._uncommitted[: max(0, len(self._uncommitted) - later)]
         deleted = frame.sequence - len(covered)  # records it covers in segments that are stored and deleted
-        if deleted < 0 or (deleted == 0 and frame.payload != CHECKSUM.pack(span_checksum(covered))):
+        if deleted < 0 or (
+            deleted == 0 and frame.payload != spool_format.CHECKSUM.pack(spool_format.span_checksum(covered))
+        ):
             raise SpoolDamaged(path, self._cut.offset, "the records before it differ from those that were synced")
         del self._uncommitted[: len(covered)]
 
@@ -295,10 +277,10 @@ def _not_next(
     return SpoolDamaged(path, offset, f"event {sequence} of episode {name} follows {before and before[0]}")
 
 
-def check_record(path: Path, offset: int, frame: Frame) -> None:
+def check_record(path: Path, offset: int, frame: spool_format.Frame) -> None:
     """Raise `SpoolDamaged` for a frame that no recorder writes although its checksum is right."""
-    type_name = check_type(path, offset, frame.type)
-    if frame.kind != EVENT:
+    type_name = spool_format.check_type(path, offset, frame.type)
+    if frame.kind != spool_format.EVENT:
         _check_declaration(path, offset, type_name, frame.payload)
 
 
@@ -314,37 +296,41 @@ def _check_declaration(path: Path, offset: int, type_name: str, payload: bytes) 
         raise SpoolDamaged(path, offset, "the declaration is not valid UTF-8 without NUL, so no database can store it")
 
 
-def read_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
+def read_header(
+    path: Path, buffer: spool_format.Buffer, *, recorder: bytes, number: int
+) -> spool_format.SegmentHeader | None:
     """Decode a segment's header; None if it is preallocated or torn. Raises `SpoolForeign` for another recorder's."""
-    format_number = format_of(buffer)
-    if format_number is not None and format_number > FORMAT:
-        raise SpoolForeign(f"{path} is in format {format_number} of a newer program; this one reads format {FORMAT}")
-    header = decode_header(buffer)
+    format_number = spool_format.format_of(buffer)
+    if format_number is not None and format_number > spool_format.FORMAT:
+        raise SpoolForeign(
+            f"{path} is in format {format_number} of a newer program; this one reads format {spool_format.FORMAT}"
+        )
+    header = spool_format.decode_header(buffer)
     if header is not None and (header.recorder, header.number) != (recorder, number):
         raise SpoolForeign(f"{path} is segment {header.number} of recorder {episode_text(EpisodeId(header.recorder))}")
     return header
 
 
-def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, Frame]]:
+def whole_frames(buffer: spool_format.Buffer, start: int, salt: int) -> Iterator[tuple[int, spool_format.Frame]]:
     """Find every frame from `start` on, with its offset, whatever bytes lie between them."""
-    salted = CHECKSUM.pack(salt)
+    salted = spool_format.CHECKSUM.pack(salt)
     end = start
     index = buffer.find(salted, start)
     while index >= 0:
         offset = index - _SALT_OFFSET
-        if offset >= end and offset % 8 == 0 and (frame := decode(buffer, offset, salt)) is not None:
+        if offset >= end and offset % 8 == 0 and (frame := spool_format.decode(buffer, offset, salt)) is not None:
             yield offset, frame
             end = offset + frame.size
         index = buffer.find(salted, max(index + 1, end))
 
 
-def last_event(buffer: Buffer, salt: int) -> Frame | None:
+def last_event(buffer: spool_format.Buffer, salt: int) -> spool_format.Frame | None:
     """Search the segment from its end for the last whole frame with an event; None if it has no event."""
-    salted = CHECKSUM.pack(salt)
+    salted = spool_format.CHECKSUM.pack(salt)
     index = buffer.rfind(salted)
     while index >= 0:
-        frame = decode(buffer, index - _SALT_OFFSET, salt) if index >= _SALT_OFFSET else None
-        if frame is not None and frame.kind == EVENT:
+        frame = spool_format.decode(buffer, index - _SALT_OFFSET, salt) if index >= _SALT_OFFSET else None
+        if frame is not None and frame.kind == spool_format.EVENT:
             return frame
         index = buffer.rfind(salted, 0, index + len(salted) - 1)
     return None
@@ -355,12 +341,14 @@ def _refuse_damage(folder: Path, recorder: bytes, prefix: ValidPrefix) -> None:
     for number in prefix.numbers:
         if number < prefix.cut.number:
             continue
-        path = segment_path(folder, number)
+        path = spool_format.segment_path(folder, number)
         start = prefix.cut.offset if number == prefix.cut.number else 0
-        for offset, frame in whole_frames(read_segment(path), start, salt_of(recorder, number)):
-            if frame.kind == COMMIT and frame.position > prefix.cut.position:
+        for offset, frame in whole_frames(
+            spool_format.read_segment(path), start, spool_format.salt_of(recorder, number)
+        ):
+            if frame.kind == spool_format.COMMIT and frame.position > prefix.cut.position:
                 raise SpoolDamaged(
-                    segment_path(folder, prefix.cut.number),
+                    spool_format.segment_path(folder, prefix.cut.number),
                     prefix.cut.offset,
                     f"position {prefix.cut.position + 1} is missing, although the commit frame at byte {offset} of"
                     f" {path.name} covers all records up to position {frame.position}",
@@ -376,14 +364,14 @@ def seal(folder: Path, prefix: ValidPrefix) -> None:
         if tail:
             write_durably(path.with_name(f"{path.name}{TAIL}"), tail)
     for number in prefix.numbers:
-        path = segment_path(folder, number)
+        path = spool_format.segment_path(folder, number)
         if number > prefix.cut.number:
             path.unlink(missing_ok=True)
         elif number == prefix.cut.number:
             with path.open("rb+") as file:
                 file.truncate(prefix.cut.offset)
                 os.fsync(file.fileno())
-    sync_folder(folder)
+    spool_format.sync_folder(folder)
 
 
 def sync_segments(folder: Path, numbers: Iterable[int]) -> None:
@@ -393,21 +381,21 @@ def sync_segments(folder: Path, numbers: Iterable[int]) -> None:
     and then lost in a power cut, the next recovery would compute ends with the sequences of events in the log.
     """
     for number in numbers:
-        descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
+        descriptor = os.open(spool_format.segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
         try:
             os.fdatasync(descriptor)
         finally:
             os.close(descriptor)
-    sync_folder(folder)
+    spool_format.sync_folder(folder)
 
 
 def tails(folder: Path, prefix: ValidPrefix) -> list[tuple[Path, bytes]]:
     """Return each file that extends behind the cut and its bytes there, without trailing zeros. Raises `OSError`."""
     cut = prefix.cut
     return [
-        (path, read_segment(path)[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
+        (path, spool_format.read_segment(path)[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
         for number in prefix.numbers
-        if number >= cut.number and (path := segment_path(folder, number)).exists()
+        if number >= cut.number and (path := spool_format.segment_path(folder, number)).exists()
     ]
 
 
@@ -437,22 +425,22 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
 
 def _frames_behind(
     folder: Path, recorder: bytes, prefix: ValidPrefix, position: int
-) -> Iterator[tuple[ReadCursor, Frame]]:
+) -> Iterator[tuple[spool_format.ReadCursor, spool_format.Frame]]:
     """Yield the records of a prefix behind this position, each with the cursor before it."""
     for number, base in sorted(prefix.bases.items()):
         if prefix.bases.get(number + 1, prefix.cut.position + 1) <= position + 1:
             continue
-        path = segment_path(folder, number)
-        buffer, before = read_segment(path), base - 1
+        path = spool_format.segment_path(folder, number)
+        buffer, before = spool_format.read_segment(path), base - 1
         header = read_header(path, buffer, recorder=recorder, number=number)
         assert header is not None, "the segment is part of the prefix"
-        offset = header_bytes(len(header.open))
-        for fields in decode_each(buffer, offset, salt_of(recorder, number)):
-            frame = make(Frame, fields)
+        offset = spool_format.header_bytes(len(header.open))
+        for fields in spool_format.decode_each(buffer, offset, spool_format.salt_of(recorder, number)):
+            frame = make(spool_format.Frame, fields)
             if before == prefix.cut.position:
                 return
-            if frame.kind != COMMIT:
+            if frame.kind != spool_format.COMMIT:
                 if before >= position:
-                    yield ReadCursor(number, offset, before), frame
+                    yield spool_format.ReadCursor(number, offset, before), frame
                 before = frame.position
             offset += frame.size

@@ -16,19 +16,9 @@ from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_named, parse_episode_id
 from pycrorm_async.queue import format as spool_format
-from pycrorm_async.queue import spool
+from pycrorm_async.queue import scan, spool
 from pycrorm_async.queue.blobs import blob_files
 from pycrorm_async.queue.locks import ALIVE, DRAIN, REFUSED, FileLock, create_folder, is_locked
-from pycrorm_async.queue.scan import (
-    SegmentScanner,
-    ValidPrefix,
-    read_header,
-    scan,
-    seal,
-    survey,
-    sync_segments,
-    truncate_at_lost_blob,
-)
 from pycrorm_async.queue.stored_segments import StoredSegments
 
 # === dead letters =============================================================================================
@@ -125,11 +115,11 @@ class _EpisodeFolder:
             if frame.kind == spool_format.EVENT:
                 self._last = _last_of(frame)
 
-        prefix, damage, self._uncommitted = survey(self.folder, self._recorder, on_frame=note_last)
+        prefix, damage, self._uncommitted = scan.survey(self.folder, self._recorder, on_frame=note_last)
         if damage is not None:
             raise damage
-        seal(self.folder, prefix)
-        sync_segments(self.folder, prefix.bases)
+        scan.seal(self.folder, prefix)
+        scan.sync_segments(self.folder, prefix.bases)
         spool_format.sync_folder(self.folder.parent)
         self._number, self._position = prefix.cut.number, prefix.cut.position
         self._bytes = _SEGMENT_BYTES  # a sealed file is not extended: begin another
@@ -208,9 +198,9 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool
                 return None
             locks.callback(lock.release)
         recorder = spool.parse_folder_name(folder.name).recorder
-        truncate_at_lost_blob(folder, recorder)
+        scan.truncate_at_lost_blob(folder, recorder)
         if check:
-            scan(folder, recorder)
+            scan.scan(folder, recorder)
         return DeadSource(folder, recorder, locks, stored)
 
 
@@ -233,7 +223,7 @@ class DeadSource:
         self._ready: list[Record] = []
         """Records scanned but not supplied yet; those beyond position `_confirmed` must wait."""
         self._confirmed = 0
-        self._scanner = SegmentScanner(folder, recorder, records=self._ready)
+        self._scanner = scan.SegmentScanner(folder, recorder, records=self._ready)
         while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
             pass
         self._released = False
@@ -358,7 +348,7 @@ class DeadSource:
                 return False
             more = self._scanner.step()
             if more:
-                sync_segments(self.folder, [self._scanner.prefix.cut.number])
+                scan.sync_segments(self.folder, [self._scanner.prefix.cut.number])
         if not more:
             self.lost = computed_ends(self._scanner.prefix)
             self._ready += self.lost
@@ -382,7 +372,7 @@ class _Batch(NamedTuple):
     complete: bool
 
 
-def computed_ends(prefix: ValidPrefix) -> tuple[Record, ...]:
+def computed_ends(prefix: scan.ValidPrefix) -> tuple[Record, ...]:
     """Compute an EpisodeEnded of status LOST for each open episode, positioned behind the last record.
 
     Named episodes get none: a later recorder can continue them.
@@ -612,7 +602,7 @@ class LiveSource:
             except FileNotFoundError:  # stored and deleted since the listing
                 continue
             with buffer:
-                header = read_header(path, buffer, recorder=self._recorder, number=number)
+                header = scan.read_header(path, buffer, recorder=self._recorder, number=number)
             if header is None or (start is not None and header.base - 1 > visible):
                 break
             start = spool_format.ReadCursor(number, spool_format.header_bytes(len(header.open)), header.base - 1)

@@ -38,19 +38,10 @@ from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.recall import cases as case_rows
 from pycrorm_async.recall import search
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, merge
-from pycrorm_async.recall.cases import (
-    CaseProjection,
-    FeatureFields,
-    Numbers,
-    Symbols,
-    read_blocks,
-    read_headings,
-    select_numbers,
-    situation,
-)
 from pycrorm_async.recall.columns import RESERVED, Case
 from pycrorm_async.record.plan_types import built_in_declaration, declared_type
 from pycrorm_async.record.values import pose_value
@@ -668,7 +659,7 @@ def _moment_us(when: datetime | str) -> int:
 #
 # Read the stored blocks of a memory; one statement finds out whether any has changed.
 
-_KEY: Final = f"{PROJECTION}{CaseProjection.name}"
+_KEY: Final = f"{PROJECTION}{case_rows.CaseProjection.name}"
 
 
 class DatabaseSource:
@@ -694,14 +685,15 @@ class DatabaseSource:
                     f"{log.address} has no cases to recall yet (with Settings(recall=False) none are made): run"
                     " `pycrorm writer --once`"
                 )
-            if tables.version != CaseProjection.version:
+            cases = case_rows.CaseProjection
+            if tables.version != cases.version:
                 raise errors.TablesOutdated(
-                    f"{log.address}: its cases have version {tables.version} instead of {CaseProjection.version}: run"
-                    f" `pycrorm rebuild {CaseProjection.name}`"
+                    f"{log.address}: its cases have version {tables.version} instead of {cases.version}: run"
+                    f" `pycrorm rebuild {cases.name}`"
                 )
-            numbers = frozenset(each.number for each in await read_headings(connection, tables.number))
+            numbers = frozenset(each.number for each in await case_rows.read_headings(connection, tables.number))
             wanted = numbers.difference(block_numbers if tables.number == generation else ())
-            added = await read_blocks(connection, tables.number, sorted(wanted)) if wanted else {}
+            added = await case_rows.read_blocks(connection, tables.number, sorted(wanted)) if wanted else {}
         return StoredBlocks(tables.number, numbers, added)
 
     async def _is_unchanged(self, log: EventLog, generation: int, block_numbers: Collection[int]) -> bool:
@@ -709,14 +701,14 @@ class DatabaseSource:
         if not block_numbers:
             return False
         if self._numbers is None or self._numbers[0] != generation:
-            self._numbers = generation, select_numbers(_KEY, generation)
+            self._numbers = generation, case_rows.select_numbers(_KEY, generation)
         with suppress(errors.PycrormError):  # where a rebuild has dropped the table; another fault is met again
             async with log.reading() as connection:
                 rows = (await connection.execute(self._numbers[1])).all()
             generations = {(number, version) for number, version, _ in rows}
-            return generations == {(generation, CaseProjection.version)} and {block for _, _, block in rows} == {
-                *block_numbers
-            }
+            return generations == {(generation, case_rows.CaseProjection.version)} and {
+                block for _, _, block in rows
+            } == {*block_numbers}
         return False
 
     async def present_names(self) -> Mapping[str, str]:
@@ -729,7 +721,9 @@ class DatabaseSource:
 # Describe the world as it is, as if an action with an object began now: the features that its case would have.
 
 
-def present_situation(target: Object | ObjectDesignator, action: str | type) -> tuple[Symbols, Numbers]:
+def present_situation(
+    target: Object | ObjectDesignator, action: str | type
+) -> tuple[case_rows.Symbols, case_rows.Numbers]:
     """Return the features of an action that would start now, without those of parameters other than the object.
 
     `action` is a designator class, or a built-in type by its description or its dtype.
@@ -741,13 +735,13 @@ def present_situation(target: Object | ObjectDesignator, action: str | type) -> 
         raise errors.CallerError(
             f"{target!r} is not an object in a world, so it has no situation: add it to a world first"
         )
-    fields = FeatureFields.of(_declaration(action))
+    fields = case_rows.FeatureFields.of(_declaration(action))
     # Events refer to objects by the sequence that added them: number the objects as an episode that began now would.
     sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
     parameters: dict[str, Any] = {}
     if fields.objects:
         parameters[fields.objects[0]] = {"object": sequences[body], "row": sequences[body]}
-    return situation(fields, parameters, _robot(body.world, sequences), _world(body.world, sequences))
+    return case_rows.situation(fields, parameters, _robot(body.world, sequences), _world(body.world, sequences))
 
 
 def _declaration(action: str | type) -> DesignatorTypeDeclared:

@@ -19,17 +19,9 @@ from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
+from pycrorm_async.events import fields as event_fields
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import encode, fingerprint
-from pycrorm_async.events.fields import (
-    AcceptedFields,
-    column_name,
-    fault_in_declaration,
-    fault_in_dtype,
-    fault_in_table,
-    table_name,
-    without_reserved_names,
-)
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
 from pycrorm_async.events.types import ItemType
 from pycrorm_async.record.values import Field, clean, clean_repr, cut, encoder_of, recorded_as, refuse
@@ -103,7 +95,7 @@ def declare(
     *,
     contradiction: Callable[[event_types.FieldDeclared], str | None],
     columns: Collection[str] = (),
-    fault: Callable[[event_types.DesignatorTypeDeclared], str | None] = fault_in_declaration,
+    fault: Callable[[event_types.DesignatorTypeDeclared], str | None] = event_fields.fault_in_declaration,
     **further: Any,
 ) -> Declared:
     """Declare a type with these fields.
@@ -118,7 +110,7 @@ def declare(
     fields: list[Field] = []
     undeclared: dict[str, str] = {}
     renamed: dict[str, Renamed] = {}
-    unreserved, taken = _unreserved(own), AcceptedFields()
+    unreserved, taken = _unreserved(own), event_fields.AcceptedFields()
     for each in own:
         field, reason = None, each.reason
         if each.shape is not None:
@@ -170,7 +162,7 @@ def declare_named(
         bases, concept = tuple(bases) or built_in.bases, concept or built_in.concept
 
     def fault(declaration: event_types.DesignatorTypeDeclared) -> str | None:
-        if (reason := fault_in_declaration(declaration)) is not None:
+        if (reason := event_fields.fault_in_declaration(declaration)) is not None:
             return reason
         if built_in is not None and built_in.kind != kind:
             return f"the built-in type {dtype} is a {built_in.kind}, not a {kind}"
@@ -213,7 +205,11 @@ def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str, str 
     for candidate in _dtype_candidates(own, kind):
         table = known_types.table_of(candidate)
         tables.append(table)
-        fault = fault_in_dtype(candidate) or fault_in_table(table) or known_types.fault_in_table(table, candidate)
+        fault = (
+            event_fields.fault_in_dtype(candidate)
+            or event_fields.fault_in_table(table)
+            or known_types.fault_in_table(table, candidate)
+        )
         if fault is None:
             return candidate, table, first_fault
         first_fault = first_fault or reason_text(fault)
@@ -233,7 +229,7 @@ def _fault_in_aliases(declaration: event_types.DesignatorTypeDeclared, known_typ
     """Return the reason why the table of a former dtype cannot be this one's; None if it can."""
     for alias in declaration.aliases:
         for field in declaration.fields:
-            reason = known_types.fault_in_field(field, table_name(alias))
+            reason = known_types.fault_in_field(field, event_fields.table_name(alias))
             if reason is not None:
                 return f"its alias {alias!r} does not fit: field {field.name!r}: {reason}"
     return None
@@ -243,9 +239,10 @@ def _unreserved(own: Sequence[OwnField]) -> dict[str, str]:
     """Return the names of fields with as many underscores as make them ones that no other field has."""
     kinds = {each.name: each.shape.kind for each in own if each.shape is not None}
     fields = [
-        event_types.FieldDeclared(name, column_name(name, kind), kind, SLOT_FIRST_FIELD) for name, kind in kinds.items()
+        event_types.FieldDeclared(name, event_fields.column_name(name, kind), kind, SLOT_FIRST_FIELD)
+        for name, kind in kinds.items()
     ]
-    return {name: each.name for name, each in zip(kinds, without_reserved_names(fields), strict=True)}
+    return {name: each.name for name, each in zip(kinds, event_fields.without_reserved_names(fields), strict=True)}
 
 
 def _named(
@@ -254,14 +251,14 @@ def _named(
     shape: FieldShape,
     contradiction: Callable[[event_types.FieldDeclared], str | None],
     columns: Collection[str],
-    taken: AcceptedFields,
+    taken: event_fields.AcceptedFields,
 ) -> tuple[event_types.FieldDeclared | None, str]:
     """Return the field under the first name that it may have, with the reason why it is not its own; or no field."""
     first_reason = ""
     for candidate in _candidates(name, unreserved, shape, columns):
         field = event_types.FieldDeclared(
             name=candidate,
-            column=column_name(candidate, shape.kind),
+            column=event_fields.column_name(candidate, shape.kind),
             type=shape.kind,
             slot=SLOT_FIRST_FIELD + taken.count,
             optional=shape.optional,
@@ -287,7 +284,7 @@ def _candidates(name: str, unreserved: str, shape: FieldShape, columns: Collecti
     yield f"{plain}_{shape.kind}"
 
 
-def _fault_in_field(field: event_types.FieldDeclared, taken: AcceptedFields) -> str | None:
+def _fault_in_field(field: event_types.FieldDeclared, taken: event_fields.AcceptedFields) -> str | None:
     if not field.name.isidentifier() or field.name.startswith("_"):
         return f"{cut(field.name, 100)!r} is not a valid field name"
     return taken.fault_in(field)
@@ -454,7 +451,7 @@ class KnownTypes:
     def table_of(self, dtype: str) -> str:
         """Return the table that the nodes of a dtype are in."""
         built_in = self.built_in(dtype)
-        return built_in.table if built_in is not None else table_name(dtype)
+        return built_in.table if built_in is not None else event_fields.table_name(dtype)
 
     def copy_of(self, table: str) -> KnownTypes:
         """Return a copy that knows this table alone."""

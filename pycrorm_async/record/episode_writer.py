@@ -25,41 +25,15 @@ from msgspec.structs import replace
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, EpisodeFull, FilesError, SpoolFull, SpoolStuck, Unrecordable
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import Heading, NotEncodable, encode, encoded_bytes
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.events.types import (
-    BlobReference,
-    EpisodeEnded,
-    EpisodeStatus,
-    EpisodeTagged,
-    FailureValue,
-    Happening,
-    MissingValue,
-    NodeEnded,
-    NodeKind,
-    NodeStarted,
-    NodeStatus,
-    ObjectReference,
-    Observed,
-    PoseValue,
-    RobotValue,
-)
+from pycrorm_async.record import values as live_values
 from pycrorm_async.record.declarations import Declared, DeclaredType
 from pycrorm_async.record.event_feed import EventFeed
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, end_statuses, episode_started
 from pycrorm_async.record.recorded_before import RecordedBefore
-from pycrorm_async.record.values import (
-    FailureCopies,
-    MissingValues,
-    ValueReader,
-    clean,
-    clean_repr,
-    cut,
-    message_of,
-    missing_in,
-    missing_value,
-)
 
 if TYPE_CHECKING:
     from pycrorm_async.record.geometry import Descriptions
@@ -80,8 +54,8 @@ class ActingRobot(NamedTuple):
             of the robot's object has it.
     """
 
-    state: RobotValue
-    written: msgspec.Raw | RobotValue
+    state: event_types.RobotValue
+    written: msgspec.Raw | event_types.RobotValue
 
 
 class EpisodeWriter:
@@ -104,7 +78,7 @@ class EpisodeWriter:
         self.emitter = emitter
         self.events: Final = EpisodeEvents(emitter, episode)
         self.nodes: Final = NodeEvents(self.events, simulated=opening.simulated)
-        self.failures: Final = FailureCopies()
+        self.failures: Final = live_values.FailureCopies()
         self._opening = opening
         self._is_begun = False
         self._is_ended = False
@@ -117,7 +91,7 @@ class EpisodeWriter:
 
     def _repr_html_(self) -> str:
         """Return the view of a notebook; it has no number, because only the database knows that."""
-        description = html.escape(" ".join(clean(self._opening.description).split())[:_DESCRIPTION_MAX])
+        description = html.escape(" ".join(live_values.clean(self._opening.description).split())[:_DESCRIPTION_MAX])
         running = '<span style="color:#2f7fd1;font-weight:bold">▶</span> RUNNING'
         kind = "Simulated episode" if self.simulated else "Episode"
         return (
@@ -128,7 +102,7 @@ class EpisodeWriter:
             "where episode is this object</div></div>"
         )
 
-    def reference(self, _key: Any, /) -> ObjectReference | None:
+    def reference(self, _key: Any, /) -> event_types.ObjectReference | None:
         """Return an object's current row; None, because an episode without a world has no objects."""
         return None
 
@@ -149,7 +123,7 @@ class EpisodeWriter:
     def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
         tags = changed_tags(self._opening.labels.tags, added, removed)
-        self.events.put(EpisodeTagged(tuple(added), tuple(removed)))
+        self.events.put(event_types.EpisodeTagged(tuple(added), tuple(removed)))
         self._opening = self._opening.with_tags(tags)
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
@@ -169,24 +143,24 @@ class EpisodeWriter:
         is_same = status in ("INTERRUPTED", "UNKNOWN")
         self.nodes.end_all(root_status if is_same else "LOST", untimed=status == "UNKNOWN")
         self.nodes.end(self.nodes.root, root_status, value)
-        self.events.put(EpisodeEnded(status, value, world=world), "Episode")
+        self.events.put(event_types.EpisodeEnded(status, value, world=world), "Episode")
         self._is_ended = True
 
-    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+    def _end_statuses(self, failure: BaseException | None) -> tuple[event_types.EpisodeStatus, event_types.NodeStatus]:
         """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
         return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
 
 
-def _started(opening: EpisodeOpening, emitter: Emitter) -> Happening:
+def _started(opening: EpisodeOpening, emitter: Emitter) -> event_types.Happening:
     """Return the first event of an episode, with texts that its columns can show."""
-    started: Happening = episode_started(opening)
+    started: event_types.Happening = episode_started(opening)
     reasons: dict[str, str] = {}
     if not fits(started, emitter.record_bytes_max):
         started, reasons = fitted(started, emitter.record_bytes_max)
     for name in ("description", "plan", "world"):
         text = getattr(started, name)
         if text is not None and len(text) > EPISODE_TEXT_MAX:
-            started = replace(started, **{name: cut(text, EPISODE_TEXT_MAX)})
+            started = replace(started, **{name: live_values.cut(text, EPISODE_TEXT_MAX)})
             reasons[name] = "its text is too long for an episode and was cut"
     emitter.note_missing("Episode", reasons)
     return started
@@ -209,14 +183,14 @@ class EpisodeEvents:
         self.emitter = emitter
         self.time: tuple[int, int] | None = None
         self._episode = episode
-        self._headings: dict[type[Happening], Heading] = {}
+        self._headings: dict[type[event_types.Happening], Heading] = {}
         self._recorded: RecordedBefore | None = None
         self._refused: Callable[[Exception], None] = lambda _error: None
         self._stored = 0
 
     def put(
         self,
-        event: Happening,
+        event: event_types.Happening,
         owner: str = "",
         *,
         may_refuse: bool = False,
@@ -238,7 +212,7 @@ class EpisodeEvents:
             event, reasons = fitted(event, emitter.record_bytes_max)
             emitter.note_missing(owner or kind.__name__, reasons, may_refuse=may_refuse)
             payload = encode(event, bytes_max=emitter.record_bytes_max)
-            if isinstance(given, NodeStarted) and isinstance(event, NodeStarted):
+            if isinstance(given, event_types.NodeStarted) and isinstance(event, event_types.NodeStarted):
                 given.parameters.update(event.parameters)  # so that the caller sees what was left out
         heading = self._headings.get(kind)
         if heading is None:
@@ -292,13 +266,13 @@ class NodeEvents:
 
     def start_root(self) -> None:
         """Write the start of the root."""
-        self.root = self._events.put(NodeStarted("root", simulated=self._simulated))
+        self.root = self._events.put(event_types.NodeStarted("root", simulated=self._simulated))
         self._open[self.root] = "Episode"
 
     def start(
         self,
         declared: DeclaredType,
-        kind: NodeKind,
+        kind: event_types.NodeKind,
         parent: int,
         parameters: dict[str, Any],
         robot: ActingRobot | None,
@@ -315,8 +289,10 @@ class NodeEvents:
         owner, emitter = declared.dtype, self._events.emitter
         if missing:
             emitter.note_missing(owner, missing, may_refuse=may_refuse)
-        written = cast("RobotValue", robot.written) if robot is not None else None
-        event = NodeStarted(kind, parent, declared.fingerprint or None, parameters, written, self._simulated)
+        written = cast("event_types.RobotValue", robot.written) if robot is not None else None
+        event = event_types.NodeStarted(
+            kind, parent, declared.fingerprint or None, parameters, written, self._simulated
+        )
         shown: dict[str, Any] = {}
         if emitter.feed.observers:
             shown = {} if robot is None else {"robot": robot.state}
@@ -329,8 +305,8 @@ class NodeEvents:
     def end(
         self,
         node: int,
-        status: NodeStatus,
-        failure: FailureValue | None = None,
+        status: event_types.NodeStatus,
+        failure: event_types.FailureValue | None = None,
         result: Any = None,
         *,
         untimed: bool = False,
@@ -343,13 +319,13 @@ class NodeEvents:
                 if failure is not None or result is not None:
                     parts = {"failure": failure.arguments if failure is not None else None, "result": result}
                     for name, value in parts.items():
-                        for each in missing_in(value):
+                        for each in live_values.missing_in(value):
                             self._events.emitter.missing.note(owner, name, each.missing)
-                self._events.put(NodeEnded(node, status, failure, result, untimed), owner)
+                self._events.put(event_types.NodeEnded(node, status, failure, result, untimed), owner)
         finally:
             self._ending.discard(node)
 
-    def end_all(self, status: NodeStatus, *, untimed: bool) -> None:
+    def end_all(self, status: event_types.NodeStatus, *, untimed: bool) -> None:
         """Write the ends of all open nodes but the root, the last one first; wait for ends in other threads."""
         for node in sorted(self._open.keys() - {self.root}, reverse=True):
             self.end(node, status, untimed=untimed)
@@ -414,7 +390,7 @@ class Emitter:
         self.is_closed = False
         self.unrecorded = 0
         self.feed = EventFeed()
-        self.missing = MissingValues()
+        self.missing = live_values.MissingValues()
         self.unawaited: tuple[str, ...] = ()
         self._fault_count = 0
         self._last_fault: str | None = None
@@ -461,7 +437,7 @@ class Emitter:
             self.put_payload(Heading(None, kind.__name__, kind.version), own.payload)
             self.feed.note_type(own.fingerprint, own.declaration)
 
-    def put_blob(self, content: bytes, media_type: str) -> BlobReference:
+    def put_blob(self, content: bytes, media_type: str) -> event_types.BlobReference:
         """Write a blob; return the reference for events put afterwards. Never waits.
 
         The blob is kept beside the queue as long as these events, until `release_blob`, and for the life of the queue
@@ -472,7 +448,7 @@ class Emitter:
         if len(content) > limit:
             raise BlobRefused(f"the blob takes {len(content):,} bytes, {limit:,} are allowed (blob_bytes_max)")
         try:
-            return BlobReference(self.sink.put_blob(content), media_type, len(content))
+            return event_types.BlobReference(self.sink.put_blob(content), media_type, len(content))
         except FilesError as error:
             raise BlobRefused(str(error)) from error
 
@@ -493,7 +469,7 @@ class Emitter:
         self.unrecorded += 1
         if self.unrecorded == 1:
             why = f"{self._closed_because} (all further ones are only counted, in `status.unrecorded`)"
-            _log.warning("%s leaves no record, because %s", cut(clean(what), _REASON_MAX), why)
+            _log.warning("%s leaves no record, because %s", live_values.cut(live_values.clean(what), _REASON_MAX), why)
 
     def note_unawaited(self, dtype: str) -> None:
         """Count a perform that was called and never awaited as a fault, and log a warning for the first of a type."""
@@ -507,7 +483,8 @@ class Emitter:
     def note_fault(self, where: str, error: BaseException) -> None:
         """Count an exception of the hooks, and log it when the count is a power of two, so that the log stays short."""
         self._fault_count += 1
-        self._last_fault = f"{where}: {type(error).__name__}: {cut(clean(message_of(error)), _REASON_MAX)}"
+        reason = live_values.cut(live_values.clean(live_values.message_of(error)), _REASON_MAX)
+        self._last_fault = f"{where}: {type(error).__name__}: {reason}"
         if self._fault_count & (self._fault_count - 1) == 0:
             _log.error("a fault of recording (%d so far): %s", self._fault_count, self._last_fault)
             _log.debug("traceback of the fault of recording", exc_info=error)
@@ -583,10 +560,10 @@ ROBOT = "robot state"
 
 def episode_text_of(text: str) -> str:
     """Clean and shorten a text for a column of an episode."""
-    return cut(clean(text), EPISODE_TEXT_MAX)
+    return live_values.cut(live_values.clean(text), EPISODE_TEXT_MAX)
 
 
-def fitted(event: Happening, bytes_max: int) -> tuple[Happening, dict[str, str]]:
+def fitted(event: event_types.Happening, bytes_max: int) -> tuple[event_types.Happening, dict[str, str]]:
     """Return the event without the parts that cannot be recorded, and the reason for each by its name.
 
     A parameter or a result becomes a `MissingValue`, an observed value null, a text is cut, and any other part gets the
@@ -609,10 +586,10 @@ def fitted(event: Happening, bytes_max: int) -> tuple[Happening, dict[str, str]]
             reason = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for the record (record_bytes_max)"
             value = _parts(event)[name]
             is_small = sizes[name] <= _MISSING_BYTES and turn < len(_CUTS) - 1
-            if isinstance(value, MissingValue):
-                smaller: Any = MissingValue(value.missing) if turn else value
-            elif isinstance(event, NodeStarted | Observed) or name == "result":
-                smaller = value if is_small else missing_value(reason, value)
+            if isinstance(value, event_types.MissingValue):
+                smaller: Any = event_types.MissingValue(value.missing) if turn else value
+            elif isinstance(event, event_types.NodeStarted | event_types.Observed) or name == "result":
+                smaller = value if is_small else live_values.missing_value(reason, value)
             else:
                 smaller = _shorter(_parts(whole)[name], characters_max)
             if smaller is not value:
@@ -621,19 +598,19 @@ def fitted(event: Happening, bytes_max: int) -> tuple[Happening, dict[str, str]]
     return event, reasons
 
 
-def _parts(event: Happening) -> dict[str, Any]:
+def _parts(event: event_types.Happening) -> dict[str, Any]:
     """Return the parts of an event that can be left out: its parameters, its observed values, or its fields."""
-    if isinstance(event, NodeStarted):
+    if isinstance(event, event_types.NodeStarted):
         return event.parameters
-    if isinstance(event, Observed):
+    if isinstance(event, event_types.Observed):
         return event.values if isinstance(event.values, dict) else {"": event.values}
     return {name: value for name in event.__struct_fields__ if (value := getattr(event, name)) is not None}
 
 
-def _with_part(event: Happening, name: str, part: Any) -> Happening:
-    if isinstance(event, NodeStarted):
+def _with_part(event: event_types.Happening, name: str, part: Any) -> event_types.Happening:
+    if isinstance(event, event_types.NodeStarted):
         return replace(event, parameters=event.parameters | {name: part})
-    if isinstance(event, Observed):
+    if isinstance(event, event_types.Observed):
         values = event.values | {name: None} if isinstance(event.values, dict) else None
         return replace(event, values=values, missing=event.missing | {name: part.missing})
     return replace(event, **{name: part})
@@ -641,9 +618,11 @@ def _with_part(event: Happening, name: str, part: Any) -> Happening:
 
 def _shorter(part: Any, characters_max: int) -> Any:
     if isinstance(part, str):
-        return cut(part, characters_max)
-    if isinstance(part, FailureValue):
-        return FailureValue(cut(part.type, _CUTS[0]), cut(part.message, characters_max))
+        return live_values.cut(part, characters_max)
+    if isinstance(part, event_types.FailureValue):
+        return event_types.FailureValue(
+            live_values.cut(part.type, _CUTS[0]), live_values.cut(part.message, characters_max)
+        )
     return type(part)() if isinstance(part, tuple | dict) else part
 
 
@@ -665,16 +644,16 @@ def _recordable(value: Any, defaults: Mapping[str, Any], name: str) -> Any:
 def _clean(value: Any) -> Any:
     """Clean texts, and leave out items and entries that JSON cannot hold. Raises `NotEncodable` if none remain."""
     if isinstance(value, str):
-        return clean(value)
+        return live_values.clean(value)
     if isinstance(value, msgspec.Struct):
         # A pose is a whole: no part is left out. A robot without its pose would have that of its object's row.
-        defaults = {} if isinstance(value, PoseValue) else _defaults(value)
-        if isinstance(value, RobotValue):
+        defaults = {} if isinstance(value, event_types.PoseValue) else _defaults(value)
+        if isinstance(value, event_types.RobotValue):
             del defaults["pose"]
         names = value.__struct_fields__
         return replace(value, **{name: _recordable(getattr(value, name), defaults, name) for name in names})
     if isinstance(value, dict):
-        entries = ((clean(key), _clean_or_none(each)) for key, each in value.items())
+        entries = ((live_values.clean(key), _clean_or_none(each)) for key, each in value.items())
         return {key: each for key, each in entries if each is not None}
     if isinstance(value, list | tuple) and (
         isinstance(value, list) or isinstance(next(iter(value), 0), msgspec.Struct)
@@ -691,7 +670,7 @@ def _clean_or_none(value: Any) -> Any:
         return None
 
 
-def fits(event: Happening, bytes_max: int) -> bool:
+def fits(event: event_types.Happening, bytes_max: int) -> bool:
     """Return whether the event can be encoded in `bytes_max` bytes."""
     try:
         encode(event, bytes_max=bytes_max)
@@ -718,8 +697,8 @@ def put_observation(episode: EpisodeWriter, name: object, values: object, node: 
     only if `may_refuse` and with `on_unrecordable="refuse"`.
     """
     emitter, name = episode.emitter, name_of(name)
-    reader = ValueReader(episode, emitter.put_blob)
-    event = Observed(name, reader.read(values), node, reader.missing)
+    reader = live_values.ValueReader(episode, emitter.put_blob)
+    event = event_types.Observed(name, reader.read(values), node, reader.missing)
     owner = f"observation {name}"
     try:
         if reader.missing:
@@ -736,7 +715,9 @@ def put_observation(episode: EpisodeWriter, name: object, values: object, node: 
 
 def name_of(name: object) -> str:
     """Return the text under which an observation of this name is recorded."""
-    return cut(clean(name if isinstance(name, str) else clean_repr(name)), _NAME_MAX)
+    return live_values.cut(
+        live_values.clean(name if isinstance(name, str) else live_values.clean_repr(name)), _NAME_MAX
+    )
 
 
 # === open episodes ============================================================================================

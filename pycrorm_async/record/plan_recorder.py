@@ -27,50 +27,15 @@ from contextvars import ContextVar
 from functools import partial, wraps
 from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
+from pycrorm_async import errors
 from pycrorm_async.connected_var import set_inside
-from pycrorm_async.errors import (
-    CallerError,
-    DeclarationRefused,
-    EpisodeFull,
-    EpisodeRefused,
-    FilesError,
-    SpoolFull,
-    SpoolStuck,
-    Unrecordable,
-)
-from pycrorm_async.events.types import (
-    Blob,
-    BriefPose,
-    CandidateValue,
-    CellsValue,
-    LocationResolved,
-    NodeReference,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectDetected,
-    ObjectMoved,
-    ObjectReference,
-    RefusalValue,
-    RobotValue,
-    SeenValue,
-    StateSampled,
-)
+from pycrorm_async.events import types as event_types
 from pycrorm_async.plan.execution import CalledPerforms, Search, Seen, Simulation, called_performs, current_simulation
 from pycrorm_async.plan.execution import recorder as plan_observer
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.plan.task import TaskTreeNode, current_node
-from pycrorm_async.record import values
-from pycrorm_async.record.episode_writer import (
-    UNAWAITED_MAX,
-    ActingRobot,
-    Emitter,
-    EpisodeWriter,
-    episode_text_of,
-    name_of,
-    put_observation,
-)
+from pycrorm_async.record import episode_writer, values
 from pycrorm_async.record.objects import ObjectRows
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, current_task
 from pycrorm_async.record.plan_types import Declarations
@@ -102,7 +67,7 @@ class NodeRecord(NamedTuple):
     poses: values.KnownPoses = ()
 
 
-class Episode(EpisodeWriter):
+class Episode(episode_writer.EpisodeWriter):
     """An open or closed episode of our own plan layer.
 
     Attributes:
@@ -137,19 +102,19 @@ class Episode(EpisodeWriter):
         """Stop recording this world; with `emptied`, record first that all its objects were removed."""
         if self.world is not None and self.world.world is world:
             if self._opening.world is None:
-                self._entered_world = episode_text_of(world.description)
+                self._entered_world = episode_writer.episode_text_of(world.description)
             if emptied:
                 self.world.empty()
             self.world.stop()
             self.world = None
 
-    def reference(self, world_object: Object, /) -> ObjectReference | None:
+    def reference(self, world_object: Object, /) -> event_types.ObjectReference | None:
         """Return the object's current row in this episode; None if there is no row."""
         return self.world.reference(world_object) if self.world is not None else None
 
-    def node_reference(self, node: TaskTreeNode | None) -> NodeReference:
+    def node_reference(self, node: TaskTreeNode | None) -> event_types.NodeReference:
         """Return a reference to this node, or to its nearest recorded ancestor; without a node, to the root."""
-        return NodeReference(str(self), self.node_or_root(node))
+        return event_types.NodeReference(str(self), self.node_or_root(node))
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
         """Write the end of the episode, after reporting performs that were never awaited."""
@@ -163,7 +128,7 @@ class Episode(EpisodeWriter):
         self.emitter.note_unawaited(designator.__dtype__)
         fault = f"{designator.__dtype__}.perform() was called and never awaited"
         if fault not in self.faults:
-            self.faults = (*self.faults[1 - UNAWAITED_MAX :], fault)
+            self.faults = (*self.faults[1 - episode_writer.UNAWAITED_MAX :], fault)
 
     def node_or_root(self, node: TaskTreeNode | None, /) -> int:
         """Return the sequence of this node or of its nearest recorded ancestor; without a node, that of the root."""
@@ -179,7 +144,7 @@ class Episode(EpisodeWriter):
         sequence = self.node_or_root(node)
         return sequence if sequence != self.nodes.root else None
 
-    def robot_state(self) -> ActingRobot | None:
+    def robot_state(self) -> episode_writer.ActingRobot | None:
         """Return the state of the robot that acts in this context; None if no robot acts, or in a second world."""
         if self.world is None:
             return None
@@ -238,7 +203,7 @@ class Recorder:
         """
         open_episode = self.episode_here()
         if open_episode is not None and open_episode.task is current_task():
-            raise EpisodeRefused(
+            raise errors.EpisodeRefused(
                 f"episode {open_episode} is open in this task already: end it first, or open the other in its own task"
             )
         simulation, world = current_simulation.get(), current_world.get()
@@ -254,7 +219,7 @@ class Recorder:
         self.episodes.add(episode)  # first, so that the memory ends an episode whose start Ctrl-C interrupted
         try:
             episode.open()
-        except FilesError as error:  # of a disk that failed meanwhile: the plan goes on and is not recorded
+        except errors.FilesError as error:  # of a disk that failed meanwhile: the plan goes on and is not recorded
             self._emitter.note_fault("EpisodeStarted", error)
         except Exception:
             self.episodes.by_id.pop(episode.id, None)
@@ -263,7 +228,7 @@ class Recorder:
             episode.enter_world(world)
         return episode
 
-    def close_episode(self, episode: EpisodeWriter, failure: BaseException | None) -> None:
+    def close_episode(self, episode: episode_writer.EpisodeWriter, failure: BaseException | None) -> None:
         """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
         if self._sampler is not None and not self._emitter.is_closed:
             self._guarded("StateSampled", self._sampler.stop_episode, episode)
@@ -329,7 +294,7 @@ class Recorder:
         except BaseException as error:
             if implicit is not None:
                 self.close_episode(implicit, error)
-            if isinstance(error, Unrecordable | DeclarationRefused) or not isinstance(error, Exception):
+            if isinstance(error, errors.Unrecordable | errors.DeclarationRefused) or not isinstance(error, Exception):
                 raise
             emitter.note_fault("NodeStarted", error)  # a fault of the memory must not reach a plan
             return
@@ -414,11 +379,11 @@ class Recorder:
         opened last.
         """
         if self.is_closed:
-            self._emitter.note_unrecorded(f"the observation {name_of(name)}")
+            self._emitter.note_unrecorded(f"the observation {episode_writer.name_of(name)}")
             return
         self._guarded("Observed", lambda: self._observe(name, values, node, may_refuse=True))
 
-    def keep(self, name: str, key: str, content: Callable[[], Blob]) -> None:
+    def keep(self, name: str, key: str, content: Callable[[], event_types.Blob]) -> None:
         """Record a content that nodes name by this key, once for all episodes of the memory.
 
         Outside an episode nothing is recorded; the next call tries again, also where the spool had no room.
@@ -426,14 +391,14 @@ class Recorder:
         if not self.is_closed and (name, key) not in self._kept and self.episode_here() is not None:
             self._guarded("Observed", self._keep, name, key, content)
 
-    def _keep(self, name: str, key: str, content: Callable[[], Blob]) -> None:
+    def _keep(self, name: str, key: str, content: Callable[[], event_types.Blob]) -> None:
         if self._observe(name, {key: content()}, None, may_refuse=False):
             self._kept.add((name, key))
 
     def _observe(self, name: str, values: object, node: TaskTreeNode | None, *, may_refuse: bool) -> int:
         """Return the sequence of the event; 0 if it was counted as missing."""
         own = self.episode_here()
-        episode: EpisodeWriter | None
+        episode: episode_writer.EpisodeWriter | None
         if node is not None:
             record: NodeRecord | None = node.record
             episode = record.episode if record is not None and record.episode.id in self.episodes.by_id else None
@@ -442,9 +407,9 @@ class Recorder:
         else:
             episode = self.episodes.last_opened()
         if episode is None:
-            self._emitter.missing.note("observation", name_of(name), "no episode is open")
+            self._emitter.missing.note("observation", episode_writer.name_of(name), "no episode is open")
             return 0
-        return put_observation(episode, name, values, episode.node_or_root(node), may_refuse=may_refuse)
+        return episode_writer.put_observation(episode, name, values, episode.node_or_root(node), may_refuse=may_refuse)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -457,7 +422,7 @@ class Recorder:
         """Call a step; a fault of the memory is counted and does not reach the plan."""
         try:
             step(*arguments)
-        except Unrecordable:
+        except errors.Unrecordable:
             raise
         except Exception as error:  # noqa: BLE001  counted
             self._emitter.note_fault(event_type, error)
@@ -474,7 +439,7 @@ def observing() -> Recorder | None:
     return observer if isinstance(observer, Recorder) else None
 
 
-def _sampler_of(emitter: Emitter) -> Sampler | None:
+def _sampler_of(emitter: episode_writer.Emitter) -> Sampler | None:
     settings = emitter.settings
     if settings.sample_interval_ms is None:
         return None
@@ -490,13 +455,13 @@ class _SimulationRecord:
         episode: the simulation's own episode; None if it could not start.
     """
 
-    def __init__(self, node: NodeReference | None, outer_episode: Episode | None) -> None:
+    def __init__(self, node: event_types.NodeReference | None, outer_episode: Episode | None) -> None:
         self.node = node
         self.outer_episode = outer_episode
         self.episode: Episode | None = None
 
 
-def _simulating_node(simulation: Simulation | None) -> NodeReference | None:
+def _simulating_node(simulation: Simulation | None) -> event_types.NodeReference | None:
     record = simulation.record if simulation is not None else None
     return record.node if isinstance(record, _SimulationRecord) else None
 
@@ -526,7 +491,7 @@ def with_tree(plan: Callable[_P, Coroutine[Any, Any, _T]]) -> Callable[_P, Corou
     is only performed. Raises `CallerError` for a function that is not `async def`.
     """
     if not inspect.iscoroutinefunction(plan):
-        raise CallerError(f"with_tree needs an `async def`, got {plan!r:.100}")
+        raise errors.CallerError(f"with_tree needs an `async def`, got {plan!r:.100}")
     named_plan = plan.func if isinstance(plan, partial) else plan
     name = named_plan.__name__
     description = (inspect.getdoc(named_plan) or name).partition("\n")[0]
@@ -547,13 +512,13 @@ def with_tree(plan: Callable[_P, Coroutine[Any, Any, _T]]) -> Callable[_P, Corou
 # Build the events of resolved locations and of perception from values of the plan.
 
 
-def location_resolved(search: Search, node: int | None) -> LocationResolved:
+def location_resolved(search: Search, node: int | None) -> event_types.LocationResolved:
     """Build the event of a resolved location designator; `node` is the sequence of the node that resolved it."""
     cells = search.cells
-    return LocationResolved(
+    return event_types.LocationResolved(
         location=clean(search.location),
         offered=tuple(
-            CandidateValue(
+            event_types.CandidateValue(
                 brief_pose(each.pose),
                 tuple(arm.name for arm in each.arms),
                 each.grasp.name if each.grasp is not None else None,
@@ -564,9 +529,9 @@ def location_resolved(search: Search, node: int | None) -> LocationResolved:
         taken=search.taken,
         considered=search.considered,
         node=node,
-        refused=tuple(RefusalValue(brief_pose(each.pose), clean(each.reason)) for each in search.refused),
+        refused=tuple(event_types.RefusalValue(brief_pose(each.pose), clean(each.reason)) for each in search.refused),
         offered_beyond=search.offered_beyond,
-        cells=CellsValue(cells.occupied, cells.hidden, cells.free) if cells is not None else None,
+        cells=event_types.CellsValue(cells.occupied, cells.hidden, cells.free) if cells is not None else None,
     )
 
 
@@ -577,16 +542,16 @@ def object_detected(
     object_type: ObjectType | None,
     seen: Sequence[Seen],
     node: int | None,
-) -> ObjectDetected:
+) -> event_types.ObjectDetected:
     """Build the event of a result of perception; `node` is the sequence of the node that requested it."""
     values = tuple(_seen_value(each, references) for each in seen)
-    return ObjectDetected(source, object_type.name if object_type is not None else None, values, node)
+    return event_types.ObjectDetected(source, object_type.name if object_type is not None else None, values, node)
 
 
-def _seen_value(seen: Seen, references: Episode) -> SeenValue:
+def _seen_value(seen: Seen, references: Episode) -> event_types.SeenValue:
     thing = seen.thing
     world_object = thing.world_object if isinstance(thing, ObjectDesignator) else thing
-    return SeenValue(  # perception often computes numbers of numpy
+    return event_types.SeenValue(  # perception often computes numbers of numpy
         clean(thing.name),
         thing.object_type.name,
         brief_pose(seen.pose if seen.pose is not None else thing.pose),
@@ -621,8 +586,10 @@ class WorldRecorder(ObjectRows[Object]):
         super().__init__(episode)
         self.world = world
         self.sampled: dict[Object, dict[str, float]] = {}
-        self._poses: dict[Object, tuple[Pose, BriefPose]] = {}
-        self._acting: dict[Object, tuple[Pose, float | None, ObjectReference | None, ActingRobot]] = {}
+        self._poses: dict[Object, tuple[Pose, event_types.BriefPose]] = {}
+        self._acting: dict[
+            Object, tuple[Pose, float | None, event_types.ObjectReference | None, episode_writer.ActingRobot]
+        ] = {}
         for each in world.objects:
             self.object_added(each)
         for each in world.objects:
@@ -639,7 +606,7 @@ class WorldRecorder(ObjectRows[Object]):
         """Stop observing the world; `reference` still works."""
         self.world.unobserve(self)
 
-    def reference(self, world_object: Object) -> ObjectReference | None:
+    def reference(self, world_object: Object) -> event_types.ObjectReference | None:
         """Return the current row of this object, or of its counterpart if it is in a copy of this world; else None."""
         row = self._references.get(world_object)
         if row is None and world_object.world is not self.world and related(world_object.world, self.world):
@@ -647,7 +614,7 @@ class WorldRecorder(ObjectRows[Object]):
             row = self._references.get(local_object) if local_object is not None else None
         return row
 
-    def robot(self) -> ActingRobot | None:
+    def robot(self) -> episode_writer.ActingRobot | None:
         """Return base pose and torso height of the robot that acts in this context; None if there is no robot."""
         robot = acting_robot(self.world)
         if robot is None:
@@ -659,12 +626,14 @@ class WorldRecorder(ObjectRows[Object]):
         made_of = self._acting.get(robot)
         if made_of is not None and made_of[0] is pose and made_of[1] == height and made_of[2] is row:
             return made_of[3]
-        state = RobotValue(self._value_of(robot, pose), robot.object_type._name_, height, row, clean(robot.name))
+        state = event_types.RobotValue(
+            self._value_of(robot, pose), robot.object_type._name_, height, row, clean(robot.name)
+        )
         acting = self.acting(state)
         self._acting[robot] = pose, height, row, acting
         return acting
 
-    def _value_of(self, world_object: Object, pose: Pose) -> BriefPose:
+    def _value_of(self, world_object: Object, pose: Pose) -> event_types.BriefPose:
         """Copy the pose of an object, once for the event of its motion and the nodes that start there."""
         recorded = self._poses.get(world_object)
         if recorded is None or recorded[0] is not pose:
@@ -675,7 +644,7 @@ class WorldRecorder(ObjectRows[Object]):
 
     def object_added(self, added: Object) -> None:
         self._put(
-            lambda: ObjectAdded(
+            lambda: event_types.ObjectAdded(
                 clean(added.name),
                 added.object_type.name,
                 self._value_of(added, added.pose),
@@ -709,7 +678,7 @@ class WorldRecorder(ObjectRows[Object]):
         if reference is None:
             return
         self._put(
-            lambda: ObjectMoved(
+            lambda: event_types.ObjectMoved(
                 reference.object,
                 clean(moved.name),
                 moved.object_type.name,
@@ -724,10 +693,10 @@ class WorldRecorder(ObjectRows[Object]):
         self._put_joints(moved, positions, self._causing_node())
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        self._put_attachment(ObjectAttached, parent, child, link, self._causing_node())
+        self._put_attachment(event_types.ObjectAttached, parent, child, link, self._causing_node())
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        self._put_attachment(ObjectDetached, parent, child, link, self._causing_node())
+        self._put_attachment(event_types.ObjectDetached, parent, child, link, self._causing_node())
 
     def _causing_node(self) -> int | None:
         """Return the node that caused a change: the context's innermost recorded node, if this episode recorded it."""
@@ -786,7 +755,7 @@ class Sampler:
         omitted: number of samples not written because the spool or the episode had no room.
     """
 
-    def __init__(self, emitter: Emitter, *, interval_ms: int, change_min: float) -> None:
+    def __init__(self, emitter: episode_writer.Emitter, *, interval_ms: int, change_min: float) -> None:
         self._emitter = emitter
         self._interval_s = interval_ms / 1000
         self._change_min = change_min
@@ -825,12 +794,14 @@ class Sampler:
                 self._sample(motion, margin=0.0)
                 motion.is_over = True
 
-    def stop_episode(self, episode: EpisodeWriter) -> None:
+    def stop_episode(self, episode: episode_writer.EpisodeWriter) -> None:
         """Stop sampling all motions of an episode, before the episode ends."""
         with self._lock:
             self._stop_motions(episode)
 
-    def _stop_motions(self, episode: EpisodeWriter) -> None:  # without a loop in `with`: see `OrderedCalls`
+    def _stop_motions(
+        self, episode: episode_writer.EpisodeWriter
+    ) -> None:  # without a loop in `with`: see `OrderedCalls`
         for key in [key for key in self._running if key[0] is episode]:
             self._running.pop(key).is_over = True
 
@@ -883,8 +854,8 @@ class Sampler:
         if not changed or motion.is_over or self._emitter.is_closed:
             return
         try:
-            motion.episode.events.put(StateSampled(reference, changed, motion.node), reserved=False)
-        except (EpisodeFull, SpoolFull, SpoolStuck):
+            motion.episode.events.put(event_types.StateSampled(reference, changed, motion.node), reserved=False)
+        except (errors.EpisodeFull, errors.SpoolFull, errors.SpoolStuck):
             self.omitted += 1
             return
         written.update(changed)

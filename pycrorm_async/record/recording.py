@@ -13,20 +13,12 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, named_episode_id, parse_episode_id
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeReference
 from pycrorm_async.record import declarations
+from pycrorm_async.record import opening as openings
 from pycrorm_async.record.arguments import Convert
 from pycrorm_async.record.declarations import RecordedKind
 from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
 from pycrorm_async.record.event_times import At, event_time
 from pycrorm_async.record.keyed_episode import OrderedCalls
-from pycrorm_async.record.opening import (
-    NO_LABELS,
-    EpisodeOpening,
-    Failures,
-    Labels,
-    Provenance,
-    check_arguments,
-    read_labels,
-)
 from pycrorm_async.record.recorded_before import StoredEpisodes
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.values import clean, clean_repr
@@ -66,7 +58,7 @@ class Recording:
         stored: Iterable[DesignatorTypeDeclared],
         *,
         software: str,
-        provenance: Provenance | None = None,
+        provenance: openings.Provenance | None = None,
         stored_episodes: StoredEpisodes | None = None,
     ) -> None:
         self.emitter = emitter
@@ -180,7 +172,7 @@ class Recording:
         simulated: bool = False,
         thought_by: NodeReference | None = None,
         convert: Convert | None = None,
-        failures: Failures = (),
+        failures: openings.Failures = (),
         id: str | UUID | None = None,  # noqa: A002  the field's word
         at: At | None = None,
         created_by: str | None = None,
@@ -230,7 +222,7 @@ class Recording:
             text,
             plan=plan,
             seed=seed,
-            labels=read_labels(tags, metadata, self.emitter.settings, self.emitter.missing),
+            labels=openings.read_labels(tags, metadata, self.emitter.settings, self.emitter.missing),
             world=world,
             simulated=simulated,
             thought_by=thought_by,
@@ -250,21 +242,21 @@ class Recording:
         *,
         plan: str | None = None,
         seed: int | None = None,
-        labels: Labels = NO_LABELS,
+        labels: openings.Labels = openings.NO_LABELS,
         world: str | None = None,
         simulated: bool = False,
         thought_by: NodeReference | None = None,
         strict: bool = False,
-    ) -> EpisodeOpening:
+    ) -> openings.EpisodeOpening:
         """Check the arguments of an episode. With `strict`, a text that is too long is refused, and not cut.
 
         Raises `CallerError`.
         """
-        check_arguments(description=description, plan=plan, seed=seed, strict=strict)
-        check_arguments(description=world, plan=None, seed=None, strict=False)
+        openings.check_arguments(description=description, plan=plan, seed=seed, strict=strict)
+        openings.check_arguments(description=world, plan=None, seed=None, strict=False)
         if thought_by is not None and not _is_whole(thought_by):
             raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
-        return EpisodeOpening(
+        return openings.EpisodeOpening(
             description, self._software, plan, seed, world, simulated, thought_by, self._provenance, labels
         )
 

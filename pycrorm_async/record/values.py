@@ -30,20 +30,9 @@ from types import NoneType
 from typing import Any, ClassVar, Final, NamedTuple, Protocol, TypeAlias, cast
 from weakref import ReferenceType, ref
 
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import clean as clean
 from pycrorm_async.events.codec import unwritable
-from pycrorm_async.events.types import (
-    Blob,
-    BlobReference,
-    BriefPose,
-    FailureValue,
-    FieldDeclared,
-    MissingValue,
-    ObjectReference,
-    ObjectValue,
-    PoseReference,
-    PoseValue,
-)
 from pycrorm_async.recorded_names import recorded_name
 from pycrorm_async.visible_text import visible
 
@@ -106,7 +95,7 @@ class ObjectLike(Protocol):
 class References(Protocol):
     """Looks up the rows of an episode's objects."""
 
-    def reference(self, key: Any, /) -> ObjectReference | None:
+    def reference(self, key: Any, /) -> event_types.ObjectReference | None:
         """Return the object's current row; None if the episode has no row of it."""
         ...
 
@@ -120,14 +109,14 @@ def recorded_as(kind: type) -> str | None:
     return getattr(kind, "__recorded_as__", None)
 
 
-def pose_value(pose: PoseLike) -> PoseValue:
+def pose_value(pose: PoseLike) -> event_types.PoseValue:
     """Copy a pose."""
-    return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
+    return event_types.PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
 
 
-def brief_pose(pose: PoseLike) -> BriefPose:
+def brief_pose(pose: PoseLike) -> event_types.BriefPose:
     """Copy a pose for a field of an event whose type is a pose."""
-    return BriefPose.of(pose_value(pose))
+    return event_types.BriefPose.of(pose_value(pose))
 
 
 class FrozenPoses:
@@ -135,14 +124,14 @@ class FrozenPoses:
 
     def __init__(self, kind: type) -> None:
         self._kind = kind
-        self._copies: dict[int, tuple[Any, PoseValue]] = {}
+        self._copies: dict[int, tuple[Any, event_types.PoseValue]] = {}
 
-    def get(self, pose: object) -> PoseValue | None:
+    def get(self, pose: object) -> event_types.PoseValue | None:
         """Return the copy of this very object; None if it has none, or may change."""
         copy = self._copies.get(id(pose))
         return copy[1] if copy is not None and copy[0] is pose else None
 
-    def keep(self, pose: PoseLike) -> PoseValue:
+    def keep(self, pose: PoseLike) -> event_types.PoseValue:
         """Copy a pose."""
         value = pose_value(pose)
         if type(pose) is self._kind:
@@ -152,13 +141,13 @@ class FrozenPoses:
         return value
 
 
-KnownPoses: TypeAlias = tuple[tuple[PoseValue, PoseReference], ...]
+KnownPoses: TypeAlias = tuple[tuple[event_types.PoseValue, event_types.PoseReference], ...]
 """The poses in parameters of a node and of those around it, each with a reference to it."""
 _KNOWN_MAX: Final = 8
 """Bounds the poses that a parameter is compared with: those of four levels of nodes, of two poses each."""
 
 
-def pose_fields(fields: Iterable[FieldDeclared]) -> tuple[tuple[str, int], ...]:
+def pose_fields(fields: Iterable[event_types.FieldDeclared]) -> tuple[tuple[str, int], ...]:
     """Return name and slot of the fields that are poses."""
     return tuple((each.name, each.slot) for each in fields if each.type == "pose")
 
@@ -178,12 +167,12 @@ def with_own(
 ) -> KnownPoses:
     """Return the known poses with those that this node was written with."""
     for name, slot in fields:
-        if type(pose := parameters.get(name)) is PoseValue:
-            poses = (*poses[1 - _KNOWN_MAX :], (pose, PoseReference(node, name, slot)))
+        if type(pose := parameters.get(name)) is event_types.PoseValue:
+            poses = (*poses[1 - _KNOWN_MAX :], (pose, event_types.PoseReference(node, name, slot)))
     return poses
 
 
-def encoder_of(field: FieldDeclared) -> Encoder:
+def encoder_of(field: event_types.FieldDeclared) -> Encoder:
     """Return the encoder of a field's declared type."""
     if field.type == "list":
         return partial(_encode_list, _ENCODERS[field.item or "text"])
@@ -200,16 +189,16 @@ def encode_or_missing(value: Any, references: References) -> Any:
         return missing_value(str(reason), value)
 
 
-def missing_value(reason: str, value: Any) -> MissingValue:
+def missing_value(reason: str, value: Any) -> event_types.MissingValue:
     """Build the `MissingValue` that replaces a value, with a shortened reason and repr."""
-    return MissingValue(
+    return event_types.MissingValue(
         cut(clean(reason), REASON_MAX), clean_repr(value.value if isinstance(value, RefusedValue) else value)
     )
 
 
-def missing_in(value: Any) -> Iterator[MissingValue]:
+def missing_in(value: Any) -> Iterator[event_types.MissingValue]:
     """Yield each `MissingValue` inside an encoded value."""
-    if isinstance(value, MissingValue):
+    if isinstance(value, event_types.MissingValue):
         yield value
     elif isinstance(value, list | dict):
         for each in value.values() if isinstance(value, dict) else value:
@@ -324,11 +313,11 @@ def _encode_member(value: Any, enum: type[Enum] | None, references: References) 
     return writable if type(writable) is str else str(writable)
 
 
-def _encode_pose(value: Any, _enum: type[Enum] | None, references: References) -> PoseValue:
+def _encode_pose(value: Any, _enum: type[Enum] | None, references: References) -> event_types.PoseValue:
     frozen: FrozenPoses | None = getattr(references, "frozen_poses", None)
     if frozen is not None and (known := frozen.get(value)) is not None:
         return known
-    is_copied = isinstance(value, PoseValue)
+    is_copied = isinstance(value, event_types.PoseValue)
     if not is_copied and recorded_as(type(value)) != "pose":
         raise _mismatch("Pose", value)
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
@@ -341,23 +330,25 @@ def _encode_pose(value: Any, _enum: type[Enum] | None, references: References) -
         return pose_value(value) if frozen is None else frozen.keep(value)
     if (len(value.position), len(value.orientation)) != (3, 4):
         raise UnrecordableValue(f"a position has 3 numbers and an orientation 4: {value}")
-    copied: PoseValue = value
+    copied: event_types.PoseValue = value
     return copied
 
 
-def _encode_object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
-    if isinstance(value, ObjectReference | ObjectValue):
+def _encode_object(
+    value: Any, _enum: type[Enum] | None, references: References
+) -> event_types.ObjectReference | event_types.ObjectValue:
+    if isinstance(value, event_types.ObjectReference | event_types.ObjectValue):
         return value
     dtype: Any = recorded_as(type(value))
     if dtype is None or dtype == "pose":
         raise _mismatch("object designator", value)
     row = references.reference(value.row_of) if value.row_of is not None else None
     if dtype == "Object":
-        return row or ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value))
-    return ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value), row)
+        return row or event_types.ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value))
+    return event_types.ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value), row)
 
 
-def _pose_or_none(value: Any) -> PoseValue | None:
+def _pose_or_none(value: Any) -> event_types.PoseValue | None:
     try:
         pose = value.pose
     except Exception:  # noqa: BLE001  the object or link was removed; `perform` reports it
@@ -401,7 +392,7 @@ _ENCODERS: dict[str, Encoder] = {
 
 
 class _NoReferences:
-    def reference(self, _key: Any, /) -> ObjectReference | None:
+    def reference(self, _key: Any, /) -> event_types.ObjectReference | None:
         return None
 
 
@@ -475,13 +466,15 @@ class ValueReader:
 
     __slots__ = ("_enclosing_ids", "_left", "_put_blob", "_references", "blobs", "missing")
 
-    def __init__(self, references: References, put_blob: Callable[[bytes, str], BlobReference] | None = None) -> None:
+    def __init__(
+        self, references: References, put_blob: Callable[[bytes, str], event_types.BlobReference] | None = None
+    ) -> None:
         self._references = references
         self._put_blob = put_blob
         self._left = ITEMS_MAX
         self._enclosing_ids: set[int] = set()
         self.missing: dict[str, str] = {}
-        self.blobs: list[BlobReference] = []
+        self.blobs: list[event_types.BlobReference] = []
 
     def read(self, value: Any, path: str = "", depth: int = 0) -> Any:
         """Return the JSON value of `value`, at this path."""
@@ -543,13 +536,13 @@ class ValueReader:
             return _require_writable(_as_built_in(value))
         if _is_numpy(value, "generic"):
             return self.read(value.item(), path, depth + 1)
-        if isinstance(value, Blob):
+        if isinstance(value, event_types.Blob):
             return self._blob(value)
         if _is_numpy(value, "ndarray"):
             return self._array(value, path, depth)
-        if recorded_as(kind) == "pose" or isinstance(value, PoseValue):
+        if recorded_as(kind) == "pose" or isinstance(value, event_types.PoseValue):
             return _encode_pose(value, None, self._references)
-        if recorded_as(kind) is not None or isinstance(value, ObjectReference | ObjectValue):
+        if recorded_as(kind) is not None or isinstance(value, event_types.ObjectReference | event_types.ObjectValue):
             return _encode_object(value, None, self._references)
         if isinstance(value, datetime):
             return _encode_datetime(value, None, self._references)
@@ -566,9 +559,9 @@ class ValueReader:
         save = sys.modules["numpy"].save
         save(file, value, allow_pickle=False)  # raises for an array of objects, or a user's own dtype
         reference = self._put(file.getvalue(), NPY)
-        return BlobReference(reference.hash, NPY, reference.size, str(value.dtype), value.shape)
+        return event_types.BlobReference(reference.hash, NPY, reference.size, str(value.dtype), value.shape)
 
-    def _blob(self, value: Blob) -> BlobReference:
+    def _blob(self, value: event_types.Blob) -> event_types.BlobReference:
         content, media_type = cast("tuple[object, object]", value)  # unchecked by the caller
         if not isinstance(content, bytes | bytearray | memoryview):
             raise UnrecordableValue(f"the content of a blob must be bytes, not {type(content).__name__}")
@@ -576,7 +569,7 @@ class ValueReader:
             raise UnrecordableValue(f"the media type of a blob must be a str of at most {_MEDIA_TYPE_MAX} characters")
         return self._put(bytes(content), media_type)
 
-    def _put(self, content: bytes, media_type: str) -> BlobReference:
+    def _put(self, content: bytes, media_type: str) -> event_types.BlobReference:
         if self._put_blob is None:
             raise UnrecordableValue("JSON cannot hold a Blob")
         try:
@@ -699,11 +692,11 @@ class FailureCopies:
     """
 
     def __init__(self) -> None:
-        self._last: tuple[ReferenceType[BaseException], object, str, FailureValue] | None = None
+        self._last: tuple[ReferenceType[BaseException], object, str, event_types.FailureValue] | None = None
 
     def copy(
         self, failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
-    ) -> FailureValue:
+    ) -> event_types.FailureValue:
         """Copy as `failure_value` does. Raises no `Exception`."""
         if not issubclass(type(failure), BaseException):  # whatever an executive gave, which may deny its class
             return failure_value(failure, references, convert)
@@ -721,9 +714,9 @@ class FailureCopies:
 
 def failure_value(
     failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
-) -> FailureValue:
+) -> event_types.FailureValue:
     """Copy class, message and arguments, each as `convert` returns it, of an exception. Raises no `Exception`."""
-    return FailureValue(
+    return event_types.FailureValue(
         type=cut(_path_of(type(failure)), _FAILURE_NAME_MAX),
         message=cut(clean(message_of(failure)), _MESSAGE_MAX),
         arguments=_arguments_or_missing(failure, references, convert),
@@ -741,7 +734,7 @@ def _arguments_or_missing(failure: BaseException, references: References, conver
     try:
         return _arguments(failure, references, convert, 0)
     except Exception as error:  # noqa: BLE001  `args` may be a property that raises anything
-        return [MissingValue(reading_fault(error))]
+        return [event_types.MissingValue(reading_fault(error))]
 
 
 def _arguments(failure: BaseException, references: References, convert: Callable[[Any], Any], depth: int) -> list[Any]:
