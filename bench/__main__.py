@@ -77,6 +77,7 @@ RUNS = (
     Run("rebuild, large", _LARGE, quick=False),
     Run("rebuild postgresql, large", (*_POSTGRESQL, *_LARGE), quick=False),
     Run("growth", ("--turns", "2")),
+    Run("placement"),
     Run("thesis, 488,043 nodes", _WHOLE, quick=False),
     Run("thesis postgresql, 488,043 nodes", (*_POSTGRESQL, *_WHOLE), quick=False),
 )

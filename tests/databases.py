@@ -27,11 +27,13 @@ import asyncpg
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.placement import Placement
 
 __all__ = [
     "Server",
     "server_in",
     "server_in_memory",
+    "PARTITIONS",
     "put_memory",
     "ask",
     "ask_each",
@@ -42,6 +44,8 @@ __all__ = [
     "run_in_own_loop",
 ]
 
+PARTITIONS: Final = int(os.environ.get("PYCRORM_TEST_PARTITIONS", "0"))
+"""The partitions of each new memory on PostgreSQL; without the variable its tables are plain."""
 _T = TypeVar("_T")
 _ROOM_BYTES: Final = 4 << 30
 """A server takes at most half a gigabyte, and each test process starts one or two."""
@@ -269,7 +273,8 @@ def await_events(file: Path, count: int) -> None:
 
 
 async def _make_memory(url: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    placement = Placement(PARTITIONS if url.startswith("postgresql:") else 0)
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True, placement=placement)
     try:
         await Projector(log).open()
     finally:

@@ -32,6 +32,7 @@ from pycrorm_async.recall.cases import CaseProjection, read_left_out
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import Incarnation
 
 # === durability ===============================================================================================
@@ -170,6 +171,7 @@ class DatabaseState:
         unmade, failed_views: the reasons why designator types have no tables and views are left out, by name.
         stored_on: number of machines that hold each stored event, and the names of the synchronous standbys.
         went_back: each time at which the log was noticed to have lost stored events.
+        placement: that of the memory's rows.
     """
 
     episodes: Sequence[EpisodeState] = ()
@@ -182,6 +184,7 @@ class DatabaseState:
     stored_on: StoredOn | None = None
     went_back: Sequence[Incarnation] = ()
     are_tables_outdated: bool = False
+    placement: Placement = PLAIN
 
 
 def status(place: Place, as_json: JsonOption = False) -> int:
@@ -228,6 +231,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
                 "running": state.running,
                 "running_total": state.running_total,
                 "went_back": [each._asdict() for each in state.went_back],
+                "placement": state.placement._asdict(),
                 "core": {"compiled": core.IS_COMPILED, "reason": core.PURE_REASON},
             }
         )
@@ -237,6 +241,8 @@ def status(place: Place, as_json: JsonOption = False) -> int:
         _print_running(state.running, state.running_total)
         _print_workers(workers)
         print_durability(kept, state.stored_on, state.went_back)
+        if state.placement != PLAIN:
+            stdout.print(f"The memory's tables have {state.placement}.", markup=False)
         for projection in state.projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
@@ -370,6 +376,7 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
             await log.stored_on(),
             await log.incarnations(),
             bool(outdated),
+            await log.placement(),
         )
     finally:
         await log.close()

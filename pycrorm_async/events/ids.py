@@ -32,6 +32,9 @@ SEQUENCE_MAX = 2**26 - 1
 SLOT_MAX = 2**5 - 1
 """Bounds the row ids of one event: the 5 bits of a row id that hold the slot."""
 
+NUMBER_SHIFT = 31
+"""The bits of a row id behind the episode's number, those of the sequence and the slot."""
+
 _NAMES = uuid.UUID("7f0e6c1a-3b52-4a8e-9f0d-5d2f1c7a64b1")
 """The namespace of the names of episodes, chosen at random."""
 
@@ -60,17 +63,17 @@ def row_id(number: int, sequence: int, slot: int) -> RowId:
     assert 0 <= number <= EPISODE_NUMBER_MAX, number
     assert 0 <= sequence <= SEQUENCE_MAX, sequence
     assert 0 <= slot <= SLOT_MAX, slot
-    return RowId(number << 31 | sequence << 5 | slot)
+    return RowId(number << NUMBER_SHIFT | sequence << 5 | slot)
 
 
 def row_id_min(number: int, sequence: int = 0) -> int:
     """Return the lowest row id of an episode from an event on; `number` may exceed its maximum by 1, for a bound."""
-    return number << 31 | sequence << 5
+    return number << NUMBER_SHIFT | sequence << 5
 
 
 def row_key(row: int) -> RowKey:
     """Unpack a row id; the inverse of `row_id`."""
-    return RowKey(EpisodeNumber(row >> 31), Sequence(row >> 5 & SEQUENCE_MAX), row & SLOT_MAX)
+    return RowKey(EpisodeNumber(row >> NUMBER_SHIFT), Sequence(row >> 5 & SEQUENCE_MAX), row & SLOT_MAX)
 
 
 def episode_id(wall_ns: int, randomness: bytes) -> EpisodeId:

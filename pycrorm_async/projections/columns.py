@@ -373,14 +373,16 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 # `pycrorm_async.events.ids`: a node, its designator and its leaf row have one id, and so have an object's row and its
 # pose. Foreign keys are not enforced, because that would cost a third of the write rate; `verify` checks integrity.
 #
-# The tables can be divided by episode. No row refers to a row of another episode, views and relationships join by id
-# and episode, and on PostgreSQL the episode is part of every primary key, as a table partitioned by it requires. The id
-# comes first in the key, so that a lookup by id alone, which is unique in the memory, finds its row as well.
+# PostgreSQL partitions the tables by episode if the memory is placed so (`store.placement`). No row refers to a row of
+# another episode, views and relationships join by id and episode, and on PostgreSQL the episode is part of every
+# primary key, as a table partitioned by it requires. The id comes first in the key, so that a lookup by id alone, which
+# is unique in the memory, finds its row as well.
 #
-# Three kinds of tables are not divided. `pycrorm_link_box` has the boxes of descriptions, each once by its content,
-# however many episodes use it: a catalogue of which each part needs a copy, as of the declarations. A row of
-# `recall_block`, the index of the recall of all episodes, has cases of many of them, and 0 as its episode. The
-# checkpoints of a projection (`pycrorm_progress`) are keyed by the number of an episode, as `episode` is.
+# Three kinds of tables are not partitioned. `pycrorm_link_box` has the boxes of descriptions, each once by its content,
+# however many episodes use it: a catalogue, as the declarations are. The lists of episodes (`process_metadata`,
+# `simulated_episode`) have one row for each, as `episode` has. So have the checkpoints of a projection
+# (`pycrorm_progress`). A row of `recall_block`, the index of the recall of all episodes, has cases of many of them, and
+# 0 as its episode: one partition has all of them.
 
 _TEXT_KEYS = ("field", "joint", "channel", "model")
 """The columns of keys that are texts; all others are integers."""

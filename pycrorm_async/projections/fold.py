@@ -37,6 +37,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.columns import (
     COLUMNS,
     CORE,
+    EPISODE,
     LINK_BOX,
     OF_NO_EPISODE,
     column_type,
@@ -548,7 +549,9 @@ class TableRows:
         ):
             if ends:
                 kinds = {name: column_type(CORE[table][name]).compile(dialect=connection.dialect) for name in fields}
-                await dialect.update_rows(connection, physical_name(table, generation), kinds, ends)
+                episode = EPISODE if EPISODE in CORE[table] else None
+                name = physical_name(table, generation)
+                await dialect.update_rows(connection, name, kinds, ends, episode=episode)
         for number in rows.lost:
             await connection.execute(
                 text(

@@ -61,6 +61,7 @@ from pycrorm_async.projections.mapped_tables import view_text
 from pycrorm_async.projections.views import Tables, ViewDefinition, projection_views, public_views
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.placement import PLAIN, Placement
 
 PROJECTION_VERSION = 10
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
@@ -335,23 +336,35 @@ async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[s
     """Create these tables of a generation, given by name and columns, with their indexes."""
     dialect = dialect_of(connection)
     if tables:
-        texts = table_texts(tables, generation, dialect.stored_column, connection.dialect)
+        placement = await dialect.placement(connection)
+        texts = table_texts(tables, generation, dialect.stored_column, connection.dialect, placement)
         await dialect.execute_all(connection, texts)
         await dialect.expect(connection, [expected(name, dict(each), generation) for name, each in tables.items()])
 
 
 def table_texts(
-    tables: Mapping[str, Mapping[str, Storage]], generation: int, stored: _Stored, dialect: Dialect
+    tables: Mapping[str, Mapping[str, Storage]],
+    generation: int,
+    stored: _Stored,
+    dialect: Dialect,
+    placement: Placement = PLAIN,
 ) -> list[str]:
     """Return the statements that create these tables and their indexes."""
     syntax = _syntax_of(dialect)
-    of_each = (_definitions(name, tuple(each.items()), generation, stored, syntax) for name, each in tables.items())
+    of_each = (
+        _definitions(name, tuple(each.items()), generation, stored, syntax, placement) for name, each in tables.items()
+    )
     return [*chain.from_iterable(of_each)]
 
 
 @lru_cache(maxsize=_TEXTS_KEPT)
 def _definitions(
-    name: str, columns: tuple[tuple[str, Storage], ...], generation: int, stored: _Stored, syntax: _Syntax
+    name: str,
+    columns: tuple[tuple[str, Storage], ...],
+    generation: int,
+    stored: _Stored,
+    syntax: _Syntax,
+    placement: Placement,
 ) -> tuple[str, ...]:
     table = make_table(name, dict(columns), generation, stored)
     indexes = sorted(
@@ -359,7 +372,11 @@ def _definitions(
         key=lambda each: str(each.name),
     )
     definitions: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
-    statements = [str(each.compile(dialect=syntax.dialect)) for each in definitions]
+    create, *others = (str(each.compile(dialect=syntax.dialect)) for each in definitions)
+    statements = [
+        *placement.creation(create.rstrip(), table.name, EPISODE if EPISODE in dict(columns) else None),
+        *others,
+    ]
     if syntax.name == "postgresql":  # bytes are packed already, so that compressing them again only takes time
         packed = [each.name for each in columns_in_order(table) if isinstance(each.type, LargeBinary)]
         statements += [f"ALTER TABLE {table.name} ALTER COLUMN {each} SET STORAGE EXTERNAL" for each in packed]
@@ -408,7 +425,9 @@ async def make_materialised(connection: AsyncConnection, kept: MaterialisedView,
     """Create the two tables of a materialised view, empty."""
     stored = dialect_of(connection).stored_column
     rows = make_table(kept.table, kept.columns, generation, stored)
-    await connection.execute(CreateTable(rows))
+    create = str(CreateTable(rows).compile(dialect=connection.dialect)).rstrip()
+    placement = await dialect_of(connection).placement(connection)
+    await dialect_of(connection).execute_all(connection, placement.creation(create, rows.name, EPISODE))
     index = Index(index_name(kept.table, EPISODE, generation), rows.c[EPISODE])
     await connection.execute(CreateIndex(index))
     await connection.execute(CreateTable(make_table(kept.progress, _PROGRESS, generation, stored)))
@@ -495,12 +514,12 @@ async def refresh_some(
 # aborts the whole transaction, and growing is tried again with the next batch. A user's view that cannot be created any
 # more is not blamed on a declaration either: `show` leaves it out.
 #
-# One transaction creates the tables of at most `_SLICE` declarations, because a server keeps a lock for each of them
+# One transaction creates at most `_SLICE` tables and partitions, because a server keeps a lock for each of them
 # until COMMIT. A caller whose generation is still smaller than the layout it folded for commits and calls again.
 
 _SLICE = 1_000
-"""Bounds the tables created in one transaction: a default PostgreSQL has room for some 7,000 locks, and a table with
-its index, its TOAST table and its view takes up to five."""
+"""Bounds the tables and partitions created in one transaction: a default PostgreSQL has room for some 7,000
+locks, and a table with its index, its TOAST table and its view takes up to five."""
 
 
 class GrowthTarget(Protocol):
@@ -519,18 +538,19 @@ async def grow(
     Returns the grown generation. Raises every database error that is not such a refusal; then the caller must roll its
     transaction back.
     """
-    return await _grow(connection, target, generation, _slice(generation.layout, payloads))
+    tables_max = _SLICE // (1 + (await dialect_of(connection).placement(connection)).partitions)
+    return await _grow(connection, target, generation, _slice(generation.layout, payloads, tables_max))
 
 
-def _slice(layout: Layout, payloads: Sequence[bytes]) -> Sequence[bytes]:
-    """Return the longest prefix of these declarations that needs at most `_SLICE` new tables."""
+def _slice(layout: Layout, payloads: Sequence[bytes], tables_max: int) -> Sequence[bytes]:
+    """Return the longest prefix of these declarations that needs at most `tables_max` new tables."""
     accepted = unite(layout, payloads).accepted
     new: set[str] = set()
     for place, payload in enumerate(payloads):
         declared = accepted.get(fingerprint(payload))
         if declared is not None and declared.table not in layout.leaves:
             new.add(declared.table)
-            if len(new) > _SLICE:
+            if len(new) > tables_max:
                 return payloads[:place]
     return payloads
 

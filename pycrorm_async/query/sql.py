@@ -191,7 +191,7 @@ _HARMLESS = (
 """Volatile functions without effects."""
 _RELATIONS = f"""
 SELECT relname::text FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
-WHERE nspname IN ('{LOG_SCHEMA}', '{VIEWS_SCHEMA}') AND relkind IN ('r', 'v')"""  # noqa: S608  our own names only
+WHERE nspname IN ('{LOG_SCHEMA}', '{VIEWS_SCHEMA}') AND relkind IN ('r', 'v', 'p') AND NOT relispartition"""  # noqa: S608  our own names only
 _DATABASE_FAULTS = ("08", "40", "53", "55", "57", "58", "XX")
 """Classes of errors that are the database's; all others are the query's own."""
 _CANCELLED = "57014"

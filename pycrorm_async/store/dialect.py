@@ -20,6 +20,7 @@ from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.codec import Record
 from pycrorm_async.store import schema
+from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import Span, StoredEvent
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
@@ -103,7 +104,11 @@ class Dialect(ABC):
     @cached_property
     def migrations(self) -> Migrations:
         """The statements that create the log, and those that bring it from each format to the next."""
-        return (tuple(chain.from_iterable(map(self.definition, schema.FORMAT_1))),)
+        return (self.first_format(PLAIN),)
+
+    def first_format(self, placement: Placement) -> tuple[str, ...]:
+        """Return the statements that create a log of format 1 with its rows in this placement."""
+        return tuple(chain.from_iterable(self.definition(each, placement) for each in schema.FORMAT_1))
 
     # --- statements of the schema ---------------------------------------------------------------------------------
 
@@ -135,16 +140,20 @@ class Dialect(ABC):
         )
         return compiled
 
-    def definition(self, table: Table, *, if_missing: bool = False) -> list[str]:
+    def definition(self, table: Table, placement: Placement = PLAIN, *, if_missing: bool = False) -> list[str]:
         """Return the statements that create a table of the log, with its indexes and triggers."""
         indexes = sorted(table.indexes, key=lambda each: str(each.name))
         for partial in (each for each in indexes if schema.WHERE in each.info):
             partial.dialect_kwargs[f"{self.syntax.name}_where"] = partial.info[schema.WHERE]
-        creations = [
-            self.creation(table, if_missing=if_missing),
+        episode = "episode" if "episode" in table.c else None
+        create = self.creation(table, if_missing=if_missing)
+        name = f"{self.log_schema}.{table.name}" if self.log_schema else table.name
+        parts = placement.parts(table.name, schema=self.log_schema) if episode else []
+        return [
+            *placement.creation(create, table.name, episode, schema=self.log_schema),
             *(str(self.compile(CreateIndex(each))) for each in indexes),
+            *chain.from_iterable(self.completion(table, each, if_missing=if_missing) for each in (name, *parts)),
         ]
-        return [*creations, *self.completion(table, if_missing=if_missing)]
 
     def creation(self, table: Table, *, if_missing: bool) -> str:
         """Return the statement that creates a table of the log."""
@@ -168,8 +177,12 @@ class Dialect(ABC):
     # --- the log --------------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def completion(self, table: Table, *, if_missing: bool) -> list[str]:
-        """Return the statements behind the creation of a table, such as what refuses to change or delete its rows."""
+    def completion(self, table: Table, name: str, *, if_missing: bool) -> list[str]:
+        """Return the statements that refuse to change or delete rows, for a table or the partition of this name."""
+
+    async def placement(self, connection: AsyncConnection) -> Placement:  # noqa: ARG002
+        """Return the placement of the memory's rows."""
+        return PLAIN
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:  # noqa: B027
         """Prepare a database, outside a transaction, for creating or migrating a log. Raises `DatabaseForeign`."""
@@ -308,9 +321,19 @@ class Dialect(ABC):
 
     @abstractmethod
     async def update_rows(
-        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+        self,
+        connection: AsyncConnection,
+        table: str,
+        columns: Mapping[str, str],
+        rows: Sequence[tuple[Any, ...]],
+        *,
+        episode: str | None = None,
     ) -> None:
-        """Update rows by id. `columns` maps names to SQL types; the first is the id. Raises `RowRefused`."""
+        """Update rows by id. `columns` maps names to SQL types; the first is the id.
+
+        `episode` names the column with the number of the episode, which leads to the partition of a row. Raises
+        `RowRefused`.
+        """
 
     # --- faults -------------------------------------------------------------------------------------------------
 

@@ -35,6 +35,7 @@ from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import EVENTS_MANY, Appending, Blobs, RunningDigests, events_warning, number_warning
 from pycrorm_async.store.dialect import LogIdentity, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
 from pycrorm_async.store.stored import DigestRow, EpisodeRow, Incarnation, Span, Stored, StoredEvent, consecutive
 
@@ -80,12 +81,14 @@ class EventLog:
         clock: Clock = SYSTEM_CLOCK,
         file_access: FileAccess = "owner",
         belongs_to: str | None = None,
+        placement: Placement = PLAIN,
     ) -> EventLog:
         """Open the log at a located address.
 
         With `create` the log is writable, and is created or migrated if necessary; otherwise it is read-only and
         nothing is written. `belongs_to` is the id of the expected log: if it is given, no log is created in an empty
-        database, because a restore may be running. `file_access` applies to a new SQLite file.
+        database, because a restore may be running. `file_access` applies to a new SQLite file, `placement` to a new log
+        on PostgreSQL.
 
         Raises `DatabaseUnavailable` (no such database, or no connection to it) or `DatabaseForeign` (another program's
         or a newer version's).
@@ -97,7 +100,7 @@ class EventLog:
                 if create:
                     if address.is_sqlite:
                         make_file(address.path, name, file_access, belongs_to=belongs_to)
-                    log_id = await _make_or_migrate(engine, name, clock.wall_ns(), belongs_to=belongs_to)
+                    log_id = await _make_or_migrate(engine, name, clock.wall_ns(), placement, belongs_to=belongs_to)
                 else:
                     if address.is_sqlite:
                         must_exist(address.path, name)
@@ -187,6 +190,11 @@ class EventLog:
             if not (await self._dialect.table_state(connection, schema.INCARNATION)).exists:
                 return []
             return await self._dialect.rows(connection, Incarnation, schema.SELECT_INCARNATIONS)
+
+    async def placement(self) -> Placement:
+        """Return the placement of the memory's rows."""
+        async with self.reading() as connection:
+            return await self._dialect.placement(connection)
 
     async def stored_on(self) -> StoredOn:
         """Return the number of machines that hold a stored event."""
@@ -365,7 +373,9 @@ async def _recognise(engine: AsyncEngine, name: str) -> str:
     return identity.log_id
 
 
-async def _make_or_migrate(engine: AsyncEngine, name: str, now_ns: int, *, belongs_to: str | None) -> str:
+async def _make_or_migrate(
+    engine: AsyncEngine, name: str, now_ns: int, placement: Placement, *, belongs_to: str | None
+) -> str:
     """Create or migrate the log in this database if necessary; return its id.
 
     With `belongs_to`, the id of the log that should be here, raises `DatabaseUnavailable` instead of creating another.
@@ -377,10 +387,12 @@ async def _make_or_migrate(engine: AsyncEngine, name: str, now_ns: int, *, belon
         identity = await _find_log(connection, name)
         if identity is None and belongs_to is not None:
             raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
-        for statements in dialect.migrations[identity.format if identity else 0 :]:
+        steps = dialect.migrations[identity.format if identity else 0 :]
+        for statements in steps if identity else (dialect.first_format(placement), *steps[1:]):
             await dialect.execute_all(connection, statements)
         if (await dialect.table_state(connection, schema.DIGEST)).creatable:
-            await dialect.execute_all(connection, dialect.definition(schema.DIGEST, if_missing=True))
+            placed = await dialect.placement(connection)
+            await dialect.execute_all(connection, dialect.definition(schema.DIGEST, placed, if_missing=True))
         format_now = len(dialect.migrations)
         if identity is None:
             identity = LogIdentity(str(uuid.uuid4()), format_now)

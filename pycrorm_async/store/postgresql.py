@@ -35,7 +35,6 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from functools import cached_property
 from itertools import chain, groupby
 from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple
@@ -47,7 +46,9 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async import errors
 from pycrorm_async.bulk_records import make
+from pycrorm_async.events import ids
 from pycrorm_async.store import dialect, postgresql_errors, schema
+from pycrorm_async.store.placement import Placement
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql_engine import PATH, STRANGER, WARNING
 from pycrorm_async.store.postgresql_engine import TABLES_SCHEMA as TABLES
@@ -125,6 +126,9 @@ BEGIN
     USING ERRCODE = 'integrity_constraint_violation';
 END $$"""
 
+COUNT_PARTITIONS = f"""
+SELECT pg_catalog.count(*)::int FROM pg_catalog.pg_inherits
+WHERE inhparent = pg_catalog.to_regclass('{LOG}.event')::oid"""
 TABLE_NAMES = f"""
 SELECT relname FROM pg_catalog.pg_class WHERE relnamespace = pg_catalog.to_regnamespace('{LOG}')::oid"""
 HAS_TABLE = f"""
@@ -208,30 +212,37 @@ class PostgreSQL(dialect.Dialect):
     place = (f"CREATE SCHEMA IF NOT EXISTS {TABLES}",)
     faults = postgresql_errors.FAULTS
 
-    @cached_property
-    def migrations(self) -> dialect.Migrations:
+    def first_format(self, placement: Placement) -> tuple[str, ...]:
         # Numbers come from a sequence, so that no robot waits for another one's transaction; a rollback leaves a hole.
         before = (f"CREATE SCHEMA {LOG}", f"CREATE SEQUENCE {LOG}.episode_number", _REFUSAL)
-        first, *later = super().migrations
-        return ((*before, *first), *later)
+        return (*before, *super().first_format(placement))
 
     # --- the log --------------------------------------------------------------------------------------------------
 
-    def completion(self, table: Table, *, if_missing: bool) -> list[str]:
+    def creation(self, table: Table, *, if_missing: bool) -> str:
+        text = super().creation(table, if_missing=if_missing)
+        if table not in (schema.EVENT, schema.DIGEST):
+            return text
+        # No room in the pages of the key, because rows are only appended.
+        return text.replace(
+            "PRIMARY KEY (episode, sequence)", "PRIMARY KEY (episode, sequence) WITH (fillfactor = 100)"
+        )
+
+    def completion(self, table: Table, name: str, *, if_missing: bool) -> list[str]:
         if "noun" not in table.info:
             return []
         noun, fixed = table.info["noun"], table.info["fixed"]
         changes = {"changed": "UPDATE OR DELETE OR TRUNCATE"}
         if fixed:
             changes = {"renamed": f"UPDATE OF {fixed}", "deleted": "DELETE OR TRUNCATE"}
-        statements = [
-            f"CREATE {'OR REPLACE ' * if_missing}TRIGGER {noun}_is_not_{name} BEFORE {change} ON {LOG}.{table.name}"
+        return [
+            f"CREATE {'OR REPLACE ' * if_missing}TRIGGER {noun}_is_not_{effect} BEFORE {change} ON {name}"
             f" FOR EACH STATEMENT EXECUTE FUNCTION {LOG}.refuse_change()"
-            for name, change in changes.items()
+            for effect, change in changes.items()
         ]
-        if table in (schema.EVENT, schema.DIGEST):  # no room in the pages of the key, because rows are only appended
-            statements.append(f"ALTER INDEX {LOG}.{table.name}_pkey SET (fillfactor = 100)")
-        return statements
+
+    async def placement(self, connection: AsyncConnection) -> Placement:
+        return Placement((await connection.exec_driver_sql(COUNT_PARTITIONS)).scalar_one())
 
     async def lock_log_changes(self, connection: AsyncConnection, key: int = dialect.LOG_CHANGES) -> None:
         await connection.exec_driver_sql(f"SELECT pg_catalog.pg_advisory_xact_lock({key})")
@@ -407,14 +418,21 @@ class PostgreSQL(dialect.Dialect):
                 await driver.copy_records_to_table(table, schema_name=place, columns=columns, records=some)
 
     async def update_rows(
-        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+        self,
+        connection: AsyncConnection,
+        table: str,
+        columns: Mapping[str, str],
+        rows: Sequence[tuple[Any, ...]],
+        *,
+        episode: str | None = None,
     ) -> None:
         arrays = ", ".join(f"${index}::{kind}[]" for index, kind in enumerate(columns.values(), 1))
         changes = ", ".join(f"{column} = change.{column}" for column in list(columns)[1:])
+        within = f" AND {table}.{episode} = (change.id >> {ids.NUMBER_SHIFT})::int" if episode else ""
         with postgresql_errors.rows_refused():
             await connection.exec_driver_sql(
                 f"UPDATE {table} SET {changes}"
-                f" FROM unnest({arrays}) AS change ({', '.join(columns)}) WHERE {table}.id = change.id",
+                f" FROM unnest({arrays}) AS change ({', '.join(columns)}) WHERE {table}.id = change.id{within}",
                 _arrays(rows, len(columns)),
             )
 
@@ -497,7 +515,8 @@ _TRANSFER = (
     EXECUTE 'ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder';
     EXECUTE 'ALTER SCHEMA {VIEWS} OWNER TO pycrorm_folder';
     FOR name IN SELECT oid::regclass FROM pg_class
-        WHERE relnamespace IN ('{TABLES}'::regnamespace, '{VIEWS}'::regnamespace) AND relkind IN ('r', 'v', 'm') LOOP
+        WHERE relnamespace IN ('{TABLES}'::regnamespace, '{VIEWS}'::regnamespace)
+        AND relkind IN ('r', 'v', 'm', 'p') LOOP
         EXECUTE format('ALTER TABLE %s OWNER TO pycrorm_folder', name);
     END LOOP;
 END $$"""

@@ -72,15 +72,15 @@ class SQLite(dialect.Dialect):
         exists, options = "IF NOT EXISTS " * if_missing, ", WITHOUT ROWID" * (table is schema.DIGEST)
         return f"CREATE TABLE {exists}{table.name} (\n    {columns}\n) STRICT{options}"
 
-    def completion(self, table: Table, *, if_missing: bool) -> list[str]:
+    def completion(self, table: Table, name: str, *, if_missing: bool) -> list[str]:
         if "noun" not in table.info:
             return []
         noun, fixed = table.info["noun"], table.info["fixed"]
         changes = {"renamed": f"UPDATE OF {fixed}"} if fixed else {"updated": "UPDATE"}
         return [
-            f"CREATE TRIGGER {'IF NOT EXISTS ' * if_missing}{noun}_is_not_{name} BEFORE {change} ON {table.name} BEGIN"
+            f"CREATE TRIGGER {'IF NOT EXISTS ' * if_missing}{noun}_is_not_{effect} BEFORE {change} ON {name} BEGIN"
             f" SELECT RAISE(ABORT, 'the event log is append-only: {table.name} refuses {change.split()[0]}'); END"
-            for name, change in {**changes, "deleted": "DELETE"}.items()
+            for effect, change in {**changes, "deleted": "DELETE"}.items()
         ]
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
@@ -209,7 +209,13 @@ class SQLite(dialect.Dialect):
             await (await _driver(connection)).execute_in_turn(insertion)
 
     async def update_rows(
-        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+        self,
+        connection: AsyncConnection,
+        table: str,
+        columns: Mapping[str, str],
+        rows: Sequence[tuple[Any, ...]],
+        *,
+        episode: str | None = None,  # noqa: ARG002  a file has no partitions
     ) -> None:
         names = list(columns)[1:]
         changes = ", ".join(f"{column} = change.column{index}" for index, column in enumerate(names, 2))

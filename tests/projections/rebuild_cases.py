@@ -111,7 +111,8 @@ def traces(url: str) -> list[str]:
     notes = [name for (name,) in ask(url, f"SELECT projection FROM {at}pycrorm_generation")]
     [(current,)] = ask(url, f"SELECT generation FROM {at}pycrorm_generation WHERE projection = 'tables'")
     listed = (
-        "SELECT tablename FROM pg_tables WHERE schemaname = 'memory_tables'"
+        "SELECT relname FROM pg_class WHERE relkind IN ('r', 'p') AND NOT relispartition"
+        " AND relnamespace = 'memory_tables'::regnamespace"
         if at
         else "SELECT name FROM sqlite_master WHERE type = 'table'"
     )

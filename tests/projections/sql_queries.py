@@ -24,11 +24,12 @@ async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Project
     return projector
 
 
-_KINDS = {"sqlite": {"table": "'table'", "view": "'view'"}, "postgresql": {"table": "'r'", "view": "'v'"}}
+_KINDS = {"sqlite": {"table": "'table'", "view": "'view'"}, "postgresql": {"table": "'r', 'p'", "view": "'v'"}}
 _NAMED = {
     "sqlite": "SELECT name FROM sqlite_master WHERE type IN ({}) ORDER BY name",
     "postgresql": "SELECT relname FROM pg_class JOIN pg_namespace AS place ON place.oid = relnamespace"
-    " WHERE nspname IN ('memory', 'memory_tables', 'pycrorm') AND relkind IN ({}) ORDER BY relname",
+    " WHERE nspname IN ('memory', 'memory_tables', 'pycrorm') AND relkind IN ({}) AND NOT relispartition"
+    " ORDER BY relname",
 }
 
 

@@ -1,4 +1,4 @@
-"""Queries for one episode, on a copy of the tables on PostgreSQL that is partitioned by episode."""
+"""Queries for one episode, on a memory on PostgreSQL that is partitioned by episode."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import pytest
 from sqlalchemy import Engine, Select, event, select
-from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import selectinload, undefer
 
 from pycrorm_async import Reading
@@ -47,10 +46,10 @@ from pycrorm_async.orm import (
     SpatialRelation,
     TaskTreeNode,
 )
-from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.placement import Placement
 from tests.databases import Server, ask, ask_each, run_in_own_loop
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
 from tests.projections.sql_queries import stored_and_folded
@@ -60,7 +59,7 @@ pytestmark = pytest.mark.slow
 EPISODES, PARTITIONS, ASKED = 12, 4, 7
 EPISODE = "process_metadata_id"
 OF_DIVIDED = f"""SELECT relname FROM pg_class JOIN pg_attribute ON attrelid = pg_class.oid
-WHERE relnamespace = 'memory_tables'::regnamespace AND relkind = 'r' AND attname = '{EPISODE}' ORDER BY relname"""
+WHERE relnamespace = 'memory_tables'::regnamespace AND relkind = 'p' AND attname = '{EPISODE}' ORDER BY relname"""
 OF_THE_LOG = """SELECT DISTINCT of_log.relname, view.relname FROM pg_rewrite
 JOIN pg_depend ON pg_depend.objid = pg_rewrite.oid JOIN pg_class of_log ON of_log.oid = pg_depend.refobjid
 JOIN pg_class view ON view.oid = pg_rewrite.ev_class
@@ -122,42 +121,18 @@ def episode(number: int) -> Script:
 
 @pytest.fixture(scope="module")
 def divided(server: Server) -> Iterator[str]:
-    """The URL of a memory whose tables and events are partitioned by episode."""
+    """The URL of a filled memory with partitions."""
     url = server.new_database()
-    run_in_own_loop(fill_and_divide(url))
+    run_in_own_loop(fill(url))
     yield url
     server.drop(url)
 
 
-async def fill_and_divide(url: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+async def fill(url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True, placement=Placement(PARTITIONS))
     records = [record for number in range(1, EPISODES + 1) for record in episode(number).records]
     await stored_and_folded(log, [*declarations(NAVIGATE, MOVE, PICK_UP, SETS, BATCH, TRY, LEARN), *records])
-    async with log.engine.begin() as connection:
-        for (table,) in (await connection.exec_driver_sql(OF_DIVIDED)).all():
-            await divide(connection, "memory_tables", table, EPISODE)
-        await divide(connection, "pycrorm", "event", "episode")
-        generation = await current_generation(connection)
-        assert generation is not None
-        for name, text in generation.views.items():
-            await connection.exec_driver_sql(f'CREATE OR REPLACE VIEW memory."{name}" AS {text}')
     await log.close()
-
-
-async def divide(connection: AsyncConnection, schema: str, table: str, by: str) -> None:
-    """Replace a table by a copy that is hash-partitioned by this column, with the same keys and indexes."""
-    parts = [
-        f'CREATE TABLE {schema}."{table}_part{part}" PARTITION OF {schema}."{table}"'
-        f" FOR VALUES WITH (MODULUS {PARTITIONS}, REMAINDER {part})"
-        for part in range(PARTITIONS)
-    ]
-    for statement in (
-        f'ALTER TABLE {schema}."{table}" RENAME TO "{table}_whole"',
-        f'CREATE TABLE {schema}."{table}" (LIKE {schema}."{table}_whole" INCLUDING ALL) PARTITION BY HASH ({by})',
-        *parts,
-        f'INSERT INTO {schema}."{table}" SELECT * FROM {schema}."{table}_whole"',
-    ):
-        await connection.exec_driver_sql(statement)
 
 
 class Statement(NamedTuple):
@@ -320,7 +295,7 @@ async def test_a_question_for_one_episode_reads_one_partition(
 
 
 def test_the_episode_is_part_of_every_primary_key(divided: str) -> None:
-    tables = [name for (name,) in ask(divided, OF_DIVIDED.replace("'r'", "'p'"))]
+    tables = [name for (name,) in ask(divided, OF_DIVIDED)]
     assert len(tables) > 40
     for table in tables:
         keys = ask(

@@ -1,0 +1,65 @@
+"""Create an empty memory, with its tables partitioned by episode where you ask for it.
+
+Panel: Operate, 0.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.output import JsonOption, print_json, stdout
+from pycrorm_async.cli.reading import Place
+from pycrorm_async.errors import CallerError
+from pycrorm_async.projections.custom import own_projections
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.placement import PARTITIONS_MAX, PLAIN, Placement
+
+
+def init(
+    *,
+    partitions: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help=f"On PostgreSQL: partition log and tables by episode, into 2 to {PARTITIONS_MAX} parts by hash.",
+        ),
+    ] = 0,
+    place: Place,
+    as_json: JsonOption = False,
+) -> None:
+    """Create an empty memory. Recording into a new URL does so as well, with plain tables.
+
+    Partitions are kept for ever: tables of new types, of a rebuild and of a copy on PostgreSQL have them too. A
+    question about one episode reads one partition of each table. To partition a memory that exists, create a new one
+    and copy the episodes into it (`pycrorm copy`). Repeating the command changes nothing.
+    """
+    address, placement = place.shared_address, Placement.of(partitions)
+    if address.is_sqlite and placement != PLAIN:
+        raise CallerError(
+            f"{address} is one file, which has no partitions: name a PostgreSQL database, or leave them out"
+        )
+    asyncio.run(_create(address, placement))
+    if as_json:
+        print_json({"url": address.to_type, "placement": placement._asdict()})
+    else:
+        stdout.print(f"{address} is a memory with {placement}.", markup=False)
+
+
+async def _create(address: DatabaseAddress, placement: Placement) -> None:
+    """Create the log and its tables, unless they exist. Raises `CallerError` if these have another placement."""
+    log = await EventLog.open(address, create=True, placement=placement)
+    try:
+        present = await log.placement()
+        if present != placement:
+            raise CallerError(
+                f"{address} is a memory already, with {present}, which never changes: copy it into a new memory with"
+                " `pycrorm copy`"
+            )
+        await Projector(log, installed=own_projections()).open()
+    finally:
+        await log.close()
