@@ -261,12 +261,13 @@ def print_rows(form: Form, document: Any, title: str, columns: Sequence[str], ro
 #
 # Parse the earliest start of an episode, as a date, a time, or an age.
 
-_AGE = re.compile(r"(\d{1,6})\s*(min|h|d|w)")
+_AGE = re.compile(r"(\d{1,6})\s*(min|h|d|w|y)")
 _UNITS = {
     "min": timedelta(minutes=1),
     "h": timedelta(hours=1),
     "d": timedelta(days=1),
     "w": timedelta(weeks=1),
+    "y": timedelta(days=365),
 }
 
 

@@ -138,7 +138,9 @@ def _print(result: VerifyResult) -> None:
             soft_wrap=True,
         )
     folded = f"{counted(result.events, 'event')} of {counted(result.episodes, 'episode')}"
-    checked = f"{folded} and {counted(result.rows, 'row')}: "
+    removed = f" ({result.archived:,} archived and {result.erased:,} erased episodes are not in the log)"
+    is_whole = not result.archived and not result.erased
+    checked = f"{folded} and {counted(result.rows, 'row')}{'' if is_whole else removed}: "
     if result.rows_without_event:
         stdout.print(
             f"{checked}events were deleted from the log, and the tables have"

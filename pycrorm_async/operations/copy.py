@@ -141,7 +141,11 @@ class _Copier:
     async def copy(self, rows: Sequence[EpisodeRow]) -> tuple[EpisodeCopy, ...]:
         self._of = sum(row.head for row in rows)
         before = await self._heads(rows)
+        removed = await self._target.removed([row.identity for row in rows if is_episode_id(row.id)])
+        self._refused |= {each.id: str(each) for each in removed.values()}
         for row in rows:
+            if row.id in self._refused:
+                continue
             try:
                 await self._copy(row, before.get(row.id, 0))
             except DamageError as damage:

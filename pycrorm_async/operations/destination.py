@@ -128,7 +128,9 @@ class LogAndTables:
                     _log.warning("%s: cannot compare with the kept segments: %s", self.log.address, error)
                     heads = {}
             rows = await self.log.heads(list(heads))
-            now = {each: rows[each].head if each in rows else 0 for each in heads}
+            removed = await self.log.removed(heads.keys() - rows.keys())
+            now = dict.fromkeys(heads, 0) | {each: row.head for each, row in rows.items()}
+            now |= {each: row.head for each, row in removed.items()}
             lost = next((each for each, head in heads.items() if now[each] < head), None)
             if lost is not None:
                 await self._heal(errors.LogWentBack(episode_text(lost), heads[lost], now[lost]), self._spool, heads)

@@ -6,7 +6,6 @@ A recording has no event loop of its own and may be called inside one, so each q
 from __future__ import annotations
 
 import asyncio
-import mmap
 import threading
 import time
 from collections.abc import Collection, Coroutine, Sequence
@@ -14,11 +13,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from pycrorm_async.errors import FlushTimeout
+from pycrorm_async.errors import EpisodeRefused, FlushTimeout
 from pycrorm_async.events.ids import EpisodeId, is_named
 from pycrorm_async.queue.format import segment_numbers, segment_path
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
+from pycrorm_async.queue.stored_segments import files_with
 from pycrorm_async.record.recorded_before import StoredEpisode, StoredPayload
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -56,7 +56,11 @@ class LogEpisodes:
         self._asked: set[EpisodeId] = set()
 
     def find(self, episode: EpisodeId) -> StoredEpisode | None:
-        """Implement `StoredEpisodes.find`. Raises `FlushTimeout` if another recorder keeps events of the episode."""
+        """Implement `StoredEpisodes.find`.
+
+        Raises `FlushTimeout` if another recorder keeps events of the episode, `EpisodeRefused` for one that was erased
+        or archived.
+        """
         self._wait_until_stored(episode)
         row = _run(self._row(episode))
         if row is None:
@@ -89,8 +93,11 @@ class LogEpisodes:
         log = await EventLog.open(self._address, create=False)
         try:
             row = await log.episode(episode)
+            removed = {} if row is not None else await log.removed([episode])
         finally:
             await log.close()
+        if removed:
+            raise EpisodeRefused(f"nothing is recorded of it: {removed[episode]}")
         return None if row is None else (row.number, row.head, row.ended_wall_ns)
 
     async def _page(self, number: int, after: int, last: int) -> Sequence[StoredPayload]:
@@ -103,19 +110,13 @@ class LogEpisodes:
 
 
 def _holds(folder: Path, episode: EpisodeId) -> bool:
-    """Return whether a recorder's folder has events of an episode; its files may be deleted meanwhile.
+    """Return whether a recorder's folder has events of an episode.
 
     Its locks do not answer that, because a writer that drains the folder of a dead recorder holds them too.
     """
     with suppress(FileNotFoundError):
-        for number in segment_numbers(folder):
-            with (
-                suppress(FileNotFoundError, ValueError),
-                segment_path(folder, number).open("rb") as file,
-                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-            ):
-                if content.find(episode) >= 0:
-                    return True
+        segments = [segment_path(folder, number) for number in segment_numbers(folder)]
+        return next(files_with(segments, episode), None) is not None
     return False
 
 

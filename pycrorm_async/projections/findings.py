@@ -241,6 +241,7 @@ class VerifyResult:
         deleted: the episodes of which events were deleted.
         rows_without_event: the number of rows, among the differences, of events that the log does not have.
         outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
+        erased, archived: the number of episodes that were removed from the log.
     """
 
     episodes: int = 0
@@ -261,6 +262,8 @@ class VerifyResult:
     deleted: set[int] = field(default_factory=set)
     rows_without_event: int = 0
     outdated: str | None = None
+    erased: int = 0
+    archived: int = 0
 
     def __post_init__(self) -> None:
         self._without_digest: set[int] = set()

@@ -173,6 +173,9 @@ async def check_outside(
                 connection, stored.EpisodeRow, schema.SELECT_HEADS, ids=[(each.id,)]
             )
             row: stored.EpisodeRow | None = next(iter(heads), None)
+            gone = await dialect_of(connection).removed(connection, schema.SELECT_REMOVED_BY_ID, ids=[(each.id,)])
+            if gone and (gone[0].head, gone[0].digest) == (each.sequence, each.digest):
+                continue  # it was the same when it was removed
             if row is None:
                 result.add_damage(
                     None, None, f"episode {each.id} is missing: a digest at event {each.sequence} is given"
@@ -375,6 +378,9 @@ async def verify(
     within = findings.EpisodeRange() if episode is None else findings.EpisodeRange(episode.number, episode.number + 1)
     with log.translated():
         if episode is None:
+            removed = await log.all_removed()
+            result.archived = sum(each.archived_in is not None for each in removed)
+            result.erased = len(removed) - result.archived
             await _check_database(log, result)
             result.unmade = await table_generations.unmade_types(log)
             result.failed_views = await table_generations.failed_views(log)

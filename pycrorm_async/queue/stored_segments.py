@@ -14,9 +14,10 @@ deleted, oldest first, after `keep_stored_s`, above `keep_stored_bytes`, above `
 from __future__ import annotations
 
 import logging
+import mmap
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -173,6 +174,37 @@ class StoredSegments:
                 getattr(error, "strerror", None) or error,
             )
         return 0
+
+
+def files_with(files: Iterable[Path], episode: EpisodeId) -> Iterator[Path]:
+    """Yield those of these files that have events of an episode, by its id; files may be deleted meanwhile."""
+    for path in files:
+        with (
+            suppress(FileNotFoundError, IsADirectoryError, ValueError),  # ValueError: an empty file
+            path.open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        ):
+            if content.find(episode) >= 0:
+                yield path
+
+
+def forget_stored(spool: Path, episodes: Iterable[EpisodeId]) -> dict[EpisodeId, list[Path]]:
+    """Delete the kept segments with events of these episodes; return, by episode, the files that still have some.
+
+    Deletes also the segments before them of the same recorder, because a healing reads segments without a gap. Files in
+    recorders' own folders stay: a process writes them, or their other records are still to be stored.
+    """
+    held: dict[EpisodeId, list[Path]] = {}
+    for episode in episodes:
+        for folder in [folder for log in _children(spool / STORED) for folder in _children(log)]:
+            segments = [segment_path(folder, number) for number in segment_numbers(folder)]
+            last = max(files_with(segments, episode), default=None)
+            for each in segments:
+                if last is not None and each <= last:
+                    _delete(each)
+        if held_in := [*files_with(sorted(spool.rglob("*")), episode)]:
+            held[episode] = held_in
+    return held
 
 
 def _delete(segment: Path) -> None:

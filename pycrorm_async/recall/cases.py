@@ -32,18 +32,19 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2
 from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
 import msgspec
+import numpy as np
 from sqlalchemy import Select, TableClause, column, delete, select, table, true
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError
 from pycrorm_async.events import types as event_types
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_key
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_id, row_key
 from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
@@ -575,6 +576,8 @@ _MERGED: Final = 16
 _FULL_LEVEL: Final = 4
 """The level of a block that is not merged any more, with 65,536 cases. It takes some 4 MB, and merging several
 of them would hold the write lock of SQLite for long."""
+_NODE: Final = row_id(0, 1, 0)
+"""The difference of the ids of two consecutive nodes."""
 _NO_EPISODE: Final = 0
 """The episode of the rows of blocks, because a block has cases of many."""
 
@@ -659,6 +662,30 @@ async def merge_blocks(connection: AsyncConnection, generation: int) -> None:
             raise DamageError(f"{len(numbers)} blocks of recall have {len(merged)} cases instead of {cases}: {_ADVICE}")
         await connection.execute(delete(blocks).where(blocks.c.id.in_(numbers)))
         await dialect.insert(connection, await dialect.insertion(rows_of(merged, generation)))
+
+
+async def remove_cases(connection: AsyncConnection, generation: int, episodes: Collection[int]) -> None:
+    """Remove the cases of these episodes, in the caller's transaction, which excludes all folds. Raises `DamageError`.
+
+    Readers keep blocks by number, so one that loses cases gets another: behind its greatest node id 5 to 31 in turn. It
+    keeps its level, so that the number of the block that it is merged into is new too.
+    """
+    table, dialect = _blocks(generation), dialect_of(connection)
+    for each in await read_headings(connection, generation):
+        if not any(each.episode_min <= number <= each.episode_max for number in episodes):
+            continue
+        block = (await read_blocks(connection, generation, [each.number]))[each.number]
+        kept = block.without(block.nodes[np.isin(block.nodes >> EPISODE_SHIFT, [*episodes])])
+        if len(kept) == len(block):
+            continue
+        await connection.execute(delete(table).where(table.c.id == each.number))
+        if len(kept):
+            whole = replace(CaseBlock.of(kept.cases()), left_out=block.left_out)  # without their words
+            [(name, [row])] = rows_of(whole, generation).items()
+            turn = max(each.number % _NODE - _FULL_LEVEL, 0) % (_NODE - _FULL_LEVEL - 1)
+            number = int(kept.nodes.max()) + _FULL_LEVEL + 1 + turn
+            rows = [(number, _NO_EPISODE, each.level, *list(row)[3:])]
+            await dialect.insert(connection, await dialect.insertion({name: rows}))
 
 
 async def _lock_blocks(connection: AsyncConnection, generation: int) -> Sequence[BlockHeading]:

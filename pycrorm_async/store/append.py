@@ -38,7 +38,16 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId
 from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialect import DECLARATIONS, Dialect, Insertion, RowRefused
-from pycrorm_async.store.stored import BLOCK_EVENTS, DigestRow, EpisodeRow, RunningDigest, Span, Stored, StoredEvent
+from pycrorm_async.store.stored import (
+    BLOCK_EVENTS,
+    DigestRow,
+    EpisodeRow,
+    RemovedEpisode,
+    RunningDigest,
+    Span,
+    Stored,
+    StoredEvent,
+)
 
 # === append rules =============================================================================================
 #
@@ -295,7 +304,8 @@ class _Plan(NamedTuple):
 class Appending:
     """One batch and its append; use it once. Digests are stored only if `digests` is given.
 
-    `witness` is an episode and its confirmed head. A new episode gets its number in `numbers` if no other has it.
+    `witness` is an episode and its confirmed head. A new episode gets its number in `numbers` if no other has it. What
+    was erased or archived is not stored again; with `restoring`, archived episodes are, under their numbers.
     """
 
     def __init__(
@@ -306,7 +316,9 @@ class Appending:
         *,
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
+        restoring: bool = False,
     ) -> None:
+        self._restoring = restoring
         self._dialect = dialect
         self._digests = digests
         self._witness = witness
@@ -315,6 +327,8 @@ class Appending:
         self._plan: _Plan | None = None
         self.warnings: dict[str, str] = {}
         """Warnings of limits that the batch came near, by "numbers" or an episode's id."""
+        self.discarded: dict[EpisodeId, RemovedEpisode] = {}
+        """The episodes of the batch that were removed from the log, and whose events are not stored again."""
         self.extension: Extension | None = None
         """The digests that `write` inserted, to be kept after the commit."""
 
@@ -378,7 +392,7 @@ class Appending:
             name, statement = episode_text(witness), schema.LOCK_EPISODES_AND_READ_WITNESS
             rows = await self._dialect.rows(connection, EpisodeRow, statement, ids=ids, witness=name)
             head = max((row.head for row in rows if row.id == name), default=0)
-            if head < confirmed:
+            if head < confirmed and not await removed_of(self._dialect, connection, [witness]):
                 raise LogWentBack(name, confirmed, head)
         return {names[row.id]: row._replace(folded=0, parked=None) for row in rows if row.id in names}
 
@@ -389,7 +403,19 @@ class Appending:
         rows = await self._read_rows(connection)
         refusals: dict[EpisodeId, str] = {}
         missing = [each for each in self._batch.episodes if each not in rows]
-        numbers = await self._assign_numbers(connection, missing) if missing else {}
+        restored: dict[EpisodeId, int] = {}
+        for each, removed in (await removed_of(self._dialect, connection, missing)).items() if missing else ():
+            missing.remove(each)
+            if removed.archived_in is None or self._batch.episodes[each][-1].sequence <= removed.head:
+                self.discarded[each] = removed
+            else:
+                refusals[each] = str(removed)
+            if self._restoring and removed.archived_in is not None:
+                self.discarded.pop(each, None)
+                refusals.pop(each, None)
+                restored[each] = removed.number
+                await self._dialect.execute(connection, schema.DELETE_REMOVED, id=removed.id)
+        numbers = restored | (await self._assign_numbers(connection, missing) if missing else {})
         for each, number in numbers.items():
             if number > EPISODE_NUMBER_MAX:
                 refusals[each] = (
@@ -413,6 +439,15 @@ class Appending:
             above = max(numbers.values(), default=0)
             numbers |= zip(new, await self._dialect.new_numbers(connection, len(new), above=above), strict=True)
         return numbers
+
+
+async def removed_of(
+    dialect: Dialect, connection: AsyncConnection, episodes: Iterable[EpisodeId]
+) -> dict[EpisodeId, RemovedEpisode]:
+    """Return those of these episodes that were erased or archived."""
+    names = {episode_text(each): each for each in episodes}
+    rows = await dialect.removed(connection, schema.SELECT_REMOVED_BY_ID, ids=[(each,) for each in names])
+    return {names[each.id]: each for each in rows}
 
 
 def _parts_of(steps: Iterable[EpisodeStep], digests: Extension | None) -> Iterator[tuple[int, list[Record]]]:
@@ -556,6 +591,8 @@ class Blobs:
         self._reading = reading
         self._writing = writing
         self.source: BlobSource | None = None
+        self.restores = False
+        """Whether to store blobs of archived episodes too."""
 
     async def store_for(self, records: Sequence[Record]) -> None:
         """Store the blobs that these records refer to and that are not stored yet, durable on return.
@@ -563,6 +600,10 @@ class Blobs:
         A blob that the source no longer has is reported and left out: waiting would not bring it back.
         """
         referring = [each for each in records if b'"$blob"' in each.payload]
+        if referring and self.source is not None:
+            async with self._reading() as connection:
+                removed = await removed_of(self._dialect, connection, {e.episode for e in referring if e.episode})
+            referring = [each for each in referring if each.episode not in removed or self.restores]
         wanted = {each.hash: each for record in referring for each in references_in(record.type, record.payload)}
         if not wanted or self.source is None:
             return

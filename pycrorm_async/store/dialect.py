@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, contextmanager
@@ -17,11 +18,11 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import PycrormError
+from pycrorm_async.errors import DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import Record
 from pycrorm_async.store import schema
 from pycrorm_async.store.placement import PLAIN, Placement
-from pycrorm_async.store.stored import Span, StoredEvent
+from pycrorm_async.store.stored import RemovedEpisode, Span, StoredEvent
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; the first N of them create format N."""
@@ -39,6 +40,10 @@ LOG_CHANGES = 7266203370152417861
 """Key of the lock that creations and migrations of a log, and changes of its tables, take. It encodes our name."""
 DECLARATIONS = LOG_CHANGES + 2
 """Key of the lock that transactions with new declarations take."""
+
+
+MADE = re.compile(r"__\d+$")
+"""Finds the name of a table that is made from the log: it ends in the number of its generation."""
 
 
 class LogIdentity(NamedTuple):
@@ -174,6 +179,15 @@ class Dialect(ABC):
         named = [(each,) for each in fingerprints]
         return await self.payloads(connection, schema.SELECT_DESCRIPTIONS, fingerprints=named)
 
+    async def removed(self, connection: AsyncConnection, statement: Executable, **values: Any) -> list[RemovedEpisode]:
+        """Execute a query of removed episodes; empty before the first removal. Raises `DatabaseUnavailable`."""
+        state = await self.table_state(connection, schema.REMOVED)
+        if state.exists and not state.readable:
+            raise DatabaseUnavailable(
+                f"this login may not read {schema.REMOVED.name}: the owner runs `pycrorm roles --create` again"
+            )
+        return await self.rows(connection, RemovedEpisode, statement, **values) if state.exists else []
+
     # --- the log --------------------------------------------------------------------------------------------------
 
     @abstractmethod
@@ -183,6 +197,21 @@ class Dialect(ABC):
     async def placement(self, connection: AsyncConnection) -> Placement:  # noqa: ARG002
         """Return the placement of the memory's rows."""
         return PLAIN
+
+    @abstractmethod
+    def deletion(self, connection: AsyncConnection, tables: Sequence[Table]) -> AbstractAsyncContextManager[None]:
+        """Permit this transaction to delete rows of these tables of the log until the context ends."""
+
+    @abstractmethod
+    async def made_tables(self, connection: AsyncConnection) -> dict[str, set[str]]:
+        """Return the columns of every table made from the log, of any generation, by its name in the database."""
+
+    @abstractmethod
+    async def purge(self, engine: AsyncEngine, tables: Sequence[str]) -> str | None:
+        """Remove the bytes of deleted rows of the log and of these tables from the files.
+
+        Returns what is left of them, and why; None if nothing is. Waits for no other process.
+        """
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:  # noqa: B027
         """Prepare a database, outside a transaction, for creating or migrating a log. Raises `DatabaseForeign`."""

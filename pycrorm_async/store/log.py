@@ -32,12 +32,29 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store import schema
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
-from pycrorm_async.store.append import EVENTS_MANY, Appending, Blobs, RunningDigests, events_warning, number_warning
+from pycrorm_async.store.append import (
+    EVENTS_MANY,
+    Appending,
+    Blobs,
+    RunningDigests,
+    events_warning,
+    number_warning,
+    removed_of,
+)
 from pycrorm_async.store.dialect import LogIdentity, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
-from pycrorm_async.store.stored import DigestRow, EpisodeRow, Incarnation, Span, Stored, StoredEvent, consecutive
+from pycrorm_async.store.stored import (
+    DigestRow,
+    EpisodeRow,
+    Incarnation,
+    RemovedEpisode,
+    Span,
+    Stored,
+    StoredEvent,
+    consecutive,
+)
 
 _log = logging.getLogger("pycrorm_async")
 _MANY_EVENTS = 1_000
@@ -67,6 +84,8 @@ class EventLog:
         self._file = _identity(address.path) if address.is_sqlite and writable else None
         self._write_turn = asyncio.Lock() if address.is_sqlite else None
         self._warned: set[str] = set()
+        self.discarded: dict[str, int] = {}
+        """The number of events that arrived of removed episodes and were discarded, by the id of the episode."""
         self.blobs = Blobs(self._dialect, self.reading, self.writing)
         self.digests: RunningDigests | None = RunningDigests(self._dialect)
         """The digests of the episodes that this process appends to; None, for a benchmark, stores none."""
@@ -145,7 +164,14 @@ class EventLog:
             return Stored({}, {})
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
-            appending = Appending(self._dialect, records, self.digests, witness=witness, numbers=numbers)
+            appending = Appending(
+                self._dialect,
+                records,
+                self.digests,
+                witness=witness,
+                numbers=numbers,
+                restoring=self.blobs.restores,
+            )
             if self._write_turn is not None and len(records) >= _MANY_EVENTS:
                 async with self.reading() as connection:
                     await appending.prepare(connection)
@@ -153,6 +179,11 @@ class EventLog:
                 stored = await appending.write(connection)
             if self.digests is not None and appending.extension is not None:
                 self.digests.keep(appending.extension)
+        for episode, removed in appending.discarded.items():
+            count = sum(each.episode == episode for each in records)
+            self.discarded[removed.id] = self.discarded.get(removed.id, 0) + count
+            if removed.archived_in is None:  # what was archived is stored there
+                appending.warnings[f"removed {removed.id}"] = f"events that arrive of it are discarded: {removed}"
         for subject, warning in appending.warnings.items():
             if subject not in self._warned:
                 self._warned.add(subject)
@@ -238,6 +269,16 @@ class EventLog:
                 return {}
             rows = await self._dialect.rows(connection, DigestRow, schema.SELECT_LAST_DIGESTS, first=first, last=last)
         return {each.number: each for each in rows}
+
+    async def removed(self, episodes: Collection[EpisodeId]) -> dict[EpisodeId, RemovedEpisode]:
+        """Read which of these episodes were erased or archived."""
+        async with self.reading() as connection:
+            return await removed_of(self._dialect, connection, episodes)
+
+    async def all_removed(self) -> list[RemovedEpisode]:
+        """Read every erased and archived episode, by number."""
+        async with self.reading() as connection:
+            return await self._dialect.removed(connection, schema.SELECT_REMOVED)
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
         """Return an episode's number; None if no event of it is stored."""
@@ -488,13 +529,15 @@ async def number_named(
     """Return the number of the named episode; `numbers` and `ids` are columns with an index each.
 
     `listed` selects the number of episodes that `pycrorm episodes` lists. Raises `UnknownEpisode`, also if several ids
-    match.
+    match; for an episode that was erased or archived, the message says when, and where it is.
     """
+    meant = {"number": 0, "first": "", "last": ""}
     # Four digits may be a number, or the beginning of an id without a letter: the number wins.
     if name.isdecimal() and name.isascii() and len(name) <= _DIGITS_MAX and str(int(name)) == name:
         number = (await connection.execute(select(numbers).where(numbers == int(name)))).scalar()
         if number is not None:
             return int(number)
+        meant["number"] = int(name)
     # Between two whole ids, because no order of texts then depends on where their hyphens are.
     first, last = (name.lower() + end[len(name) :] for end in (_NO_ID, _LAST_ID))
     if len(name) >= _DIGITS_OF_ID and is_episode_id(first):
@@ -504,6 +547,9 @@ async def number_named(
             raise UnknownEpisode(f"{count} episodes have an id that begins with {name!r}: use more of its digits")
         if count:
             return int(number)
+        meant |= {"first": first, "last": last}
+    for removed in await dialect_of(connection).removed(connection, schema.SELECT_REMOVED_NAMED, **meant):
+        raise UnknownEpisode(str(removed))
     raise UnknownEpisode(f"there is no episode {name!r} ({_present((await connection.execute(listed)).scalar_one())})")
 
 

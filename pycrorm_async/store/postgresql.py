@@ -122,6 +122,9 @@ GROUP BY nspname"""
 _REFUSAL = f"""
 CREATE FUNCTION {LOG}.refuse_change() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN
+    IF TG_OP = 'DELETE' AND pg_catalog.current_setting('pycrorm.removes', true) = 'yes' THEN
+        RETURN NULL;
+    END IF;
     RAISE EXCEPTION 'the event log is append-only: % refuses %', TG_TABLE_NAME, TG_OP
     USING ERRCODE = 'integrity_constraint_violation';
 END $$"""
@@ -129,6 +132,29 @@ END $$"""
 COUNT_PARTITIONS = f"""
 SELECT pg_catalog.count(*)::int FROM pg_catalog.pg_inherits
 WHERE inhparent = pg_catalog.to_regclass('{LOG}.event')::oid"""
+
+_PERMIT_REMOVAL = (
+    _REFUSAL.replace("CREATE FUNCTION", "CREATE OR REPLACE FUNCTION"),  # of memories that an earlier version made
+    f"""
+DO $$
+DECLARE
+    role text;
+BEGIN
+    FOREACH role IN ARRAY ARRAY['pycrorm_recorder', 'pycrorm_folder', 'pycrorm_reader'] LOOP
+        IF pg_catalog.has_schema_privilege(pg_catalog.to_regrole(role), '{LOG}', 'USAGE') THEN
+            EXECUTE pg_catalog.format('GRANT SELECT ON {LOG}.pycrorm_removed_episode TO %I', role);
+        END IF;
+    END LOOP;
+END $$""",
+)
+"""Lets the owner delete in a transaction that removes episodes, and the roles read which ones were removed."""
+
+COLUMNS_OF_TABLES = f"""
+SELECT relname, pg_catalog.array_agg(attname::text) FROM pg_catalog.pg_class
+JOIN pg_catalog.pg_attribute ON attrelid = pg_class.oid
+WHERE relnamespace = pg_catalog.to_regnamespace('{TABLES}')::oid AND relkind IN ('r', 'p') AND NOT relispartition
+AND attnum > 0 AND NOT attisdropped GROUP BY relname"""
+
 TABLE_NAMES = f"""
 SELECT relname FROM pg_catalog.pg_class WHERE relnamespace = pg_catalog.to_regnamespace('{LOG}')::oid"""
 HAS_TABLE = f"""
@@ -228,7 +254,28 @@ class PostgreSQL(dialect.Dialect):
             "PRIMARY KEY (episode, sequence)", "PRIMARY KEY (episode, sequence) WITH (fillfactor = 100)"
         )
 
+    @asynccontextmanager
+    async def deletion(self, connection: AsyncConnection, tables: Sequence[Table]) -> AsyncIterator[None]:  # noqa: ARG002
+        await connection.exec_driver_sql("SET LOCAL pycrorm.removes = 'yes'")
+        yield
+        await connection.exec_driver_sql("SET LOCAL pycrorm.removes = 'no'")
+
+    async def made_tables(self, connection: AsyncConnection) -> dict[str, set[str]]:
+        rows = await connection.exec_driver_sql(COLUMNS_OF_TABLES)
+        return {name: set(columns) for name, columns in map(tuple, rows) if dialect.MADE.search(name)}
+
+    async def purge(self, engine: AsyncEngine, tables: Sequence[str]) -> str | None:
+        log = [f"{LOG}.{each.name}" for each in (schema.EVENT, schema.DIGEST, schema.EPISODE)]
+        async with engine.connect() as connection:
+            connection = await connection.execution_options(isolation_level="AUTOCOMMIT")
+            # Also samples the columns again, because statistics have common values of them.
+            names = ", ".join([*log, *(f"{TABLES}.{_quote(each)}" for each in tables)])
+            await connection.exec_driver_sql(f"VACUUM (ANALYZE) {names}")
+        return None
+
     def completion(self, table: Table, name: str, *, if_missing: bool) -> list[str]:
+        if table is schema.REMOVED:
+            return list(_PERMIT_REMOVAL)
         if "noun" not in table.info:
             return []
         noun, fixed = table.info["noun"], table.info["fixed"]
@@ -524,13 +571,14 @@ END $$"""
 _TAKE = "SET LOCAL ROLE pycrorm_reader; RESET ROLE;"
 
 
+_LATER = (schema.INCARNATION, schema.BLOB, schema.DIGEST, schema.REMOVED)
+
+
 def _grants(appending: str) -> tuple[str, ...]:
     """Return the rights of roles that append, and of the reader."""
     reading = f"{appending}, pycrorm_reader"
     return (
-        *chain.from_iterable(
-            _DIALECT.definition(each, if_missing=True) for each in (schema.INCARNATION, schema.BLOB, schema.DIGEST)
-        ),
+        *chain.from_iterable(_DIALECT.definition(each, if_missing=True) for each in _LATER),
         f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
         f"GRANT USAGE ON SCHEMA {LOG} TO {reading}",
         f"GRANT SELECT ON ALL TABLES IN SCHEMA {LOG} TO {reading}",
@@ -556,6 +604,7 @@ GRANTS: tuple[str, ...] = (
     _TRANSFER,
     *_grants("pycrorm_recorder, pycrorm_folder"),
     f"GRANT UPDATE (folded, parked) ON {LOG}.episode TO pycrorm_folder",
+    f"GRANT UPDATE (finished_wall_ns) ON {LOG}.pycrorm_removed_episode TO pycrorm_folder",
     # For later objects of the folder: tables, and the schema of the views, which each change of the views replaces.
     "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT USAGE ON SCHEMAS TO pycrorm_reader",
     "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT SELECT ON TABLES TO pycrorm_reader",

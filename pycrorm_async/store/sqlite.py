@@ -30,6 +30,7 @@ from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.store import dialect, schema, sqlite_engine
+from pycrorm_async.store.dialect import MADE
 from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, Connection, claim
 from pycrorm_async.store.stored import Span, StoredEvent
 
@@ -37,6 +38,8 @@ _COUNT_TABLES: Final = (
     "SELECT count(*), total(name = 'pycrorm_log') FROM sqlite_master"
     " WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
 )
+_COLUMNS: Final = """
+SELECT t.name, c.name FROM sqlite_master AS t JOIN pragma_table_info(t.name) AS c WHERE t.type = 'table'"""
 # Ordered by the primary key, the only usable index. Selects sequence to monotonic_ns and the payload's length.
 SELECT_SPAN: Final = """
 SELECT json_group_array(json_array(sequence, type, version, wall_ns, monotonic_ns, length(CAST(payload AS BLOB)))),
@@ -83,6 +86,27 @@ class SQLite(dialect.Dialect):
             for effect, change in {**changes, "deleted": "DELETE"}.items()
         ]
 
+    @asynccontextmanager
+    async def deletion(self, connection: AsyncConnection, tables: Sequence[Table]) -> AsyncIterator[None]:
+        await self.execute_all(connection, [f"DROP TRIGGER {each.info['noun']}_is_not_deleted" for each in tables])
+        yield
+        triggers = chain.from_iterable(self.completion(each, each.name, if_missing=True) for each in tables)
+        await self.execute_all(connection, list(triggers))
+
+    async def made_tables(self, connection: AsyncConnection) -> dict[str, set[str]]:
+        tables: dict[str, set[str]] = {}
+        for name, column in map(tuple, await connection.exec_driver_sql(_COLUMNS)):
+            if MADE.search(name):
+                tables.setdefault(name, set()).add(column)
+        return tables
+
+    async def purge(self, engine: AsyncEngine, tables: Sequence[str]) -> str | None:  # noqa: ARG002
+        async with engine.connect() as connection:
+            await connection.execution_options(**{BEGIN: None})
+            await connection.exec_driver_sql("VACUUM")  # writes each row that is left into new pages
+            [busy, *_] = (await connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")).one()
+        return "the file or its write-ahead log, because another process reads old pages of them" if busy else None
+
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
         async with engine.connect() as connection:
             # First check that the database is ours or empty: setting the journal mode changes the file permanently.
@@ -109,6 +133,8 @@ class SQLite(dialect.Dialect):
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
         taken = (await self.execute(connection, schema.SELECT_NUMBER_MAX)).scalar_one()
+        if await self.has_table(connection, schema.REMOVED.name):
+            taken = max(taken, (await self.execute(connection, schema.SELECT_REMOVED_MAX)).scalar_one())
         first = max(taken, above) + 1
         return list(range(first, first + count))
 

@@ -26,6 +26,7 @@ takes half the time of BLAKE2b where the processor has instructions for it, as m
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Final, NamedTuple
 
@@ -85,6 +86,38 @@ class EpisodeRow(NamedTuple):
             reason = f"its id {self.id!r:.100} was changed after it was stored: it is not a UUID"
             raise LogDamaged(str(self.number), 1, reason)
         return parse_episode_id(self.id)
+
+
+class RemovedEpisode(NamedTuple):
+    """An episode whose events have left the log; its number is never given to another one.
+
+    Attributes:
+        number, id, head, started_wall_ns, ended_wall_ns: as its `EpisodeRow` had them.
+        digest: of its events up to `head`; None for an episode without one.
+        removed_wall_ns, reason: the time and the reason of the removal.
+        archived_in: the lake that holds its events; None if it was erased.
+        finished_wall_ns: the time at which nothing was left of it elsewhere; None until then.
+    """
+
+    number: int
+    id: str
+    head: int
+    started_wall_ns: int
+    ended_wall_ns: int | None
+    digest: str | None
+    removed_wall_ns: int
+    reason: str
+    archived_in: str | None = None
+    finished_wall_ns: int | None = None
+
+    def __str__(self) -> str:
+        when = f"{datetime.fromtimestamp(self.removed_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC ({self.reason})"
+        if self.archived_in is None:
+            return f"episode {self.number} ({self.id}) was erased on {when}"
+        return (
+            f"episode {self.number} ({self.id}) was archived on {when}:"
+            f" `pycrorm restore {self.id} --from {self.archived_in}` brings it back"
+        )
 
 
 class Stored(NamedTuple):

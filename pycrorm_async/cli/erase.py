@@ -1,0 +1,140 @@
+"""Erase episodes everywhere, or those older than a rule keeps.
+
+Panel: Operate, 7.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.output import Form, TagOption, counted, moment, note, parse_since, print_rows, problem
+from pycrorm_async.cli.reading import Place
+from pycrorm_async.errors import CallerError
+from pycrorm_async.operations import removal
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
+
+_NAMED = 10
+"""The episodes that the question names."""
+
+
+def erase(
+    *,
+    episodes: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[EPISODE]...", help="Numbers, ids or first digits of the ids; without, the journal."),
+    ] = None,
+    keep: Annotated[
+        str | None,
+        typer.Option(metavar="AGE", help="Instead of EPISODE: all that ended before then: 90d, 52w, or a date."),
+    ] = None,
+    tag: TagOption = None,
+    reason: Annotated[str | None, typer.Option(metavar="TEXT", help="The reason, which stays in the journal.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be erased, and change nothing.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    place: Place,
+    form: Form,
+) -> int:
+    """Erase episodes from the log, the tables, recall, blobs, kept segments of the spool and the file's free pages.
+
+    Their numbers, ids, digests, times and the reason stay, in the journal. What arrives of them later, from a spool, a
+    copy or an import, is discarded. Not rewritten are backups, replicas, and on PostgreSQL the write-ahead log and the
+    free space in pages. Run it again after an interruption, or when it has named what is left (exit code 1). On
+    PostgreSQL it needs the login that owns the log.
+    """
+    if not episodes and keep is None:
+        return asyncio.run(_print_journal(place, form))
+    if episodes and keep is not None:
+        raise CallerError("name episodes or give --keep, not both")
+    if tag and keep is None:
+        raise CallerError("--tag belongs to --keep: it chooses among the episodes that ended before then")
+    why = reason or (f"--keep {keep}" + "".join(f" --tag {each}" for each in tag or ()) if keep else "")
+    if not why:
+        raise CallerError("say why with --reason: it stays in the journal when the episode is gone")
+    return asyncio.run(_erase(place, episodes or [], keep, tag or [], why, form, dry_run=dry_run, yes=yes))
+
+
+async def _erase(
+    place: Place,
+    names: list[str],
+    keep: str | None,
+    tags: list[str],
+    reason: str,
+    form: Form,
+    *,
+    dry_run: bool,
+    yes: bool,
+) -> int:
+    log = await EventLog.open(place.shared_address, create=False)
+    try:
+        before = None if keep is None else parse_since(keep)
+        rows = await removal.erasable(log, names, ended_before=before, tags=tags)
+        if dry_run or not rows:
+            _print(form, f"To erase from {place.address}", rows)
+            return 0
+        if not yes:
+            listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
+            _ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
+        await log.close()
+        log = await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id)
+        done = await removal.erase(log, rows, reason=reason, spool=place.spool or place.address.default_spool)
+    finally:
+        await log.close()
+    _print(form, f"Erased from {place.address}", [each.removed for each in done])
+    for each in done:
+        for what in each.left:
+            problem(f"episode {each.removed.number} is erased from the log, and parts of it are left in {what}")
+    return 1 if any(each.left for each in done) else 0
+
+
+def _ask(question: str) -> None:
+    with suppress(typer.Abort):  # also where no terminal answers
+        if typer.confirm(question, err=True):
+            return
+    raise CallerError("nothing was erased; --yes answers the question")
+
+
+async def _print_journal(place: Place, form: Form) -> int:
+    log = await EventLog.open(place.shared_address, create=False)
+    try:
+        removed = await log.all_removed()
+    finally:
+        await log.close()
+    _print(form, f"Removed from {place.address}", removed)
+    if form.is_table and not removed:
+        note("nothing was erased or archived; name the episodes to erase, or give --keep")
+    return 0
+
+
+def _print(form: Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) -> None:
+    columns = ("episode", "id", "events", "ended", "removed", "reason", "archived in")
+    print_rows(
+        form,
+        [each._asdict() for each in rows],
+        title,
+        columns,
+        [
+            (
+                each.number,
+                each.id,
+                each.head,
+                _moment(each.ended_wall_ns),
+                *(
+                    (_moment(each.removed_wall_ns), each.reason, each.archived_in)
+                    if isinstance(each, RemovedEpisode)
+                    else ("", "", "")
+                ),
+            )
+            for each in rows
+        ],
+    )
+
+
+def _moment(wall_ns: int | None) -> str:
+    return "" if wall_ns is None else moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))

@@ -1,0 +1,218 @@
+"""`pycrorm erase`, and the end of `pycrorm archive`: remove episodes from a memory.
+
+Theory of operation. One transaction deletes the events of some episodes from the log, with their digests and blobs,
+and the rows made from them, in every generation and of every projection, and writes a row of `pycrorm_removed_episode`
+for each. From then on an append discards what arrives of them (`store.append`), so that spools, copies and imports
+cannot bring them back. The transaction raises the revision of every generation: a process that has folded an event of
+them before rolls its batch back (`projections.generations`). The database refuses the deletion outside of such a
+transaction, and on PostgreSQL to all but the owner of the log.
+
+What is outside of the database follows: segments that the spool keeps, pages of the file, the lake. The row says when
+nothing was left (`finished_wall_ns`); until then the same command continues, also after a kill at any step.
+
+On PostgreSQL the tables may belong to another role, whose code must not run with the rights of the owner. The owner
+then removes the events alone, and the same command, run by a login of that role, the rows of the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from sqlalchemy import text
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import CallerError, TablesForeign
+from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.events.types import references_in
+from pycrorm_async.projections.columns import EPISODE, OWN
+from pycrorm_async.projections.generations import read_generation, read_generations, write_generation
+from pycrorm_async.queue.stored_segments import forget_stored
+from pycrorm_async.recall.cases import BLOCKS, remove_cases
+from pycrorm_async.store import schema
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog, episode_named, tags_of
+from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
+
+EPISODES_AT_ONCE: Final = 100
+"""Bounds the episodes of one transaction, and with them the time for which others wait for the write lock."""
+_BLOB_EVENTS = text("SELECT type, payload FROM event WHERE episode = :number AND payload LIKE '%\"$blob\"%'")
+_REFERRED = text("SELECT 1 FROM event WHERE payload LIKE :pattern LIMIT 1")
+_REFERRED_BY_TYPE = text("SELECT 1 FROM pycrorm_declaration WHERE payload LIKE :pattern LIMIT 1")
+_DELETE_BLOB = text("DELETE FROM pycrorm_blob WHERE hash = :hash")
+
+
+class ErasedEpisode(NamedTuple):
+    """The erasure of one episode. `left` names what still holds parts of it, with the next step; empty if nothing."""
+
+    removed: RemovedEpisode
+    left: tuple[str, ...]
+
+
+async def erasable(
+    log: EventLog, names: Sequence[str], *, ended_before: datetime | None = None, tags: Collection[str] = ()
+) -> list[EpisodeRow | RemovedEpisode]:
+    """Return the named episodes, or those that ended before this time and have all these tags.
+
+    A name may be that of an episode whose erasure was interrupted. Raises `CallerError` for one that runs.
+    """
+    removed = {key: each for each in await log.all_removed() for key in (str(each.number), each.id)}
+    if ended_before is None:
+        rows = {name: removed[name] if name in removed else await episode_named(log, name) for name in names}
+        for row in rows.values():
+            _refuse_running(row)
+        return list({row.number: row for row in rows.values()}.values())
+    end_ns = ended_before.timestamp() * 1e9
+    old = [each for each in await log.episodes() if each.ended_wall_ns is not None and each.ended_wall_ns < end_ns]
+    return [each for each in old if not tags or {*tags} <= {*await tags_of(log, each)}]
+
+
+def _refuse_running(row: EpisodeRow | RemovedEpisode) -> None:
+    if isinstance(row, EpisodeRow) and row.ended_wall_ns is None and row.refused is None:
+        raise CallerError(
+            f"episode {row.number} still runs: end it first; if its process died, run `pycrorm writer --once`"
+        )
+
+
+async def erase(
+    log: EventLog, rows: Sequence[EpisodeRow | RemovedEpisode], *, reason: str, spool: Path
+) -> list[ErasedEpisode]:
+    """Erase these episodes, or finish their erasure. Raises `CallerError` for one that runs."""
+    there = [each for each in rows if isinstance(each, EpisodeRow)]
+    left: list[str] = []
+    for first in range(0, len(there), EPISODES_AT_ONCE):
+        await remove(log, there[first : first + EPISODES_AT_ONCE], reason=reason)
+    numbers = [each.number for each in rows]
+    tables = await _remove_rows(log, numbers, left)
+    if fault := await dialect_of(log.engine).purge(log.engine, tables):
+        left.append(f"{fault}: run it again when that has ended")
+    identities = {parse_episode_id(each.id): each for each in rows}
+    held = forget_stored(spool, identities)
+    now = {each.number: each for each in await log.all_removed()}
+    done: list[ErasedEpisode] = []
+    for identity, row in identities.items():
+        files = [f"{each}: run `pycrorm writer --once` if its process has ended" for each in held.get(identity, ())]
+        done.append(ErasedEpisode(now[row.number], (*left, *files)))
+    finished = [each.removed for each in done if not each.left and each.removed.finished_wall_ns is None]
+    if finished:
+        async with log.writing() as connection:
+            statement = schema.UPDATE_FINISHED
+            await dialect_of(connection).execute(
+                connection, statement, now_ns=SYSTEM_CLOCK.wall_ns(), numbers=[(each.number,) for each in finished]
+            )
+    return done
+
+
+async def remove(
+    log: EventLog,
+    rows: Sequence[EpisodeRow],
+    *,
+    reason: str,
+    archived_in: str | None = None,
+    digests: Mapping[int, str] | None = None,
+) -> list[RemovedEpisode]:
+    """Remove these episodes from log and tables, in one transaction; return those removed.
+
+    An episode to archive that was changed since its row was read stays. Raises `CallerError` for one that runs, and for
+    one to archive `TablesForeign` where this login may not use the tables.
+    """
+    now_ns = SYSTEM_CLOCK.wall_ns()
+    if digests is None:
+        kept = [await log.last_digests(row.number, row.number) for row in rows]
+        digests = {number: each.digest for some in kept for number, each in some.items()}
+    with log.translated():
+        async with log.writing() as connection:
+            dialect = dialect_of(connection)
+            await dialect.lock_log_changes(connection)
+            await dialect.create_if_missing(connection, schema.REMOVED)
+            try:
+                tables = await _lock_tables(connection)
+            except TablesForeign:
+                if archived_in is not None:
+                    raise
+                tables = {}
+            names = [(each.id,) for each in rows]
+            present = await dialect.rows(connection, EpisodeRow, schema.LOCK_EPISODES, ids=names)
+            if archived_in is not None:
+                heads = {each.number: each.head for each in rows}
+                present = [each for each in present if each.head == heads[each.number]]
+            removed = []
+            for row in present:
+                _refuse_running(row)
+                fields = row.number, row.id, row.head, row.started_wall_ns, row.ended_wall_ns
+                finished_ns = None if archived_in is None else now_ns
+                digest = digests.get(row.number)
+                removed.append(RemovedEpisode(*fields, digest, now_ns, reason, archived_in, finished_ns))
+            if removed:
+                numbers = [each.number for each in removed]
+                await _delete_rows(connection, tables, numbers)
+                await dialect.execute(connection, schema.UPSERT_REMOVED, removed=removed)
+                await _delete_events(connection, numbers)
+    return removed
+
+
+async def _delete_events(connection: AsyncConnection, numbers: Sequence[int]) -> None:
+    dialect = dialect_of(connection)
+    hashes: set[str] = set()
+    for number in numbers:
+        for kind, payload in await connection.execute(_BLOB_EVENTS, {"number": number}):
+            hashes |= {each.hash for each in references_in(kind, payload.encode())}
+    digests = [schema.DIGEST] if (await dialect.table_state(connection, schema.DIGEST)).exists else []
+    if not (await dialect.table_state(connection, schema.BLOB)).exists:
+        hashes.clear()
+    tables = [schema.EVENT, *digests, schema.EPISODE, *([schema.BLOB] if hashes else [])]
+    async with dialect.deletion(connection, tables):
+        for each in (schema.EVENT, *digests, schema.EPISODE):
+            key = "number" if each is schema.EPISODE else "episode"
+            await connection.exec_driver_sql(f"DELETE FROM {each.name} WHERE {key} IN {_list(numbers)}")  # noqa: S608
+        for blob in sorted(hashes):  # a blob that an event of another episode, or a type, refers to stays
+            pattern = {"pattern": f"%{blob}%"}
+            for statement in (_REFERRED, _REFERRED_BY_TYPE):
+                if (await connection.execute(statement, pattern)).first() is not None:
+                    break
+            else:
+                await connection.execute(_DELETE_BLOB, {"hash": blob})
+
+
+async def _remove_rows(log: EventLog, numbers: Sequence[int], left: list[str]) -> Sequence[str]:
+    """Delete the rows of removed episodes that the tables may still have; return the tables."""
+    try:
+        with log.translated():
+            async with log.writing() as connection:
+                await dialect_of(connection).lock_log_changes(connection)
+                tables = await _lock_tables(connection)
+                await _delete_rows(connection, tables, numbers)
+    except TablesForeign as fault:
+        left.append(f"the tables: {fault}; then run it again with that login")
+        return []
+    return list(tables)
+
+
+async def _lock_tables(connection: AsyncConnection) -> dict[str, set[str]]:
+    """Return the columns of all made tables, by name; roll back every batch that other processes have folded."""
+    dialect = dialect_of(connection)
+    if not await dialect.has_table(connection, "pycrorm_generation", to_change=True):
+        return {}
+    for key in await read_generations(connection):
+        generation = await read_generation(connection, key, hold="change")
+        if generation is not None:
+            await write_generation(connection, key, replace(generation, revision=generation.revision + 1))
+    return await dialect.made_tables(connection)
+
+
+async def _delete_rows(connection: AsyncConnection, tables: Mapping[str, set[str]], numbers: Sequence[int]) -> None:
+    for name, columns in tables.items():
+        is_keyed = columns <= {"id", "folded", "parked"} or "process_metadata__" in name
+        if is_keyed or EPISODE in columns:
+            key = "id" if is_keyed else EPISODE
+            await connection.exec_driver_sql(f'DELETE FROM "{name}" WHERE {key} IN {_list(numbers)}')  # noqa: S608
+        if f"{OWN}{BLOCKS}__" in name:
+            await remove_cases(connection, int(name.rpartition("__")[2]), numbers)
+
+
+def _list(numbers: Sequence[int]) -> str:
+    return f"({', '.join(str(int(each)) for each in numbers)})"
