@@ -37,7 +37,9 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE.html", help="The file to write; default: episode-NUMBER.html, episodes.html."
+            "--out",
+            metavar="FILE.html",
+            help="The file to write; default: episode-NUMBER.html, episodes.html. With --all also a folder.",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
@@ -91,7 +93,8 @@ def _write_overview(
         output.print_line(written.path)
         episodes = output.counted(written.episodes, "episode")
         listed = f"the newest {episodes} of {written.left_out + written.episodes:,}" if written.left_out else episodes
-        output.note(f"It has {listed}; pages of {written.pages} are in {out.stem}.pages beside it.")
+        where = f"in {out.stem}.pages beside it" if written.path == out else "beside it"
+        output.note(f"It has {listed}; pages of {written.pages} are {where}.")
         if written.left_out:
             output.note("--since, --status, --tag, --robot and --text choose others.")
         if written.pages + len(written.unreadable) < written.episodes:

@@ -15,20 +15,34 @@ import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
 from contextlib import asynccontextmanager
-from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, TablesPending
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded, with_poses
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    EpisodeTagged,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    with_poses,
+)
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.frames import TRIED
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import parameters_text, with_object_names
 from pycrorm_async.report.document import EpisodePage, document_behind, read_into
-from pycrorm_async.report.overview import NO_REASON, failures_by_reason, newest_episodes, overview_document
+from pycrorm_async.report.overview import (
+    NO_REASON,
+    OBJECTS_MAX,
+    causes_of,
+    commit_text,
+    newest_episodes,
+    overview_document,
+)
 from pycrorm_async.report.write import outcomes_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named, grown_episodes, is_simulated
@@ -266,7 +280,7 @@ async def _close(overview: LiveOverview, log: EventLog | None) -> None:
 #
 # Keep the list of episodes up to date: those that had ended from the tables, the others from their events.
 
-_LISTED_MAX = 2_000
+_LISTED_MAX = 10_000
 """Bounds the episodes of the list that are read from the tables."""
 _ENDED_MAX = 500
 """Bounds the activities that are kept of episodes that have ended meanwhile."""
@@ -333,12 +347,12 @@ class LiveOverview:
         self._asked_s = time.monotonic()
         shown = (self._unjudged - {each.number for each in await log.behind()}) & self._activities.keys()
         try:
-            outcomes = await failures_by_reason(self._reading, shown) if shown else {}
+            causes = await causes_of(self._reading, shown) if shown else {}
         except (DatabaseUnavailable, TablesPending):  # the list shows what the events say
             return []
         self._unjudged -= shown
         for each in shown:
-            self._activities[each].outcomes = outcomes.get(each, {})
+            self._activities[each].judged = causes.get(each, [])
         return sorted(shown)
 
     def _is_behind(self, row: EpisodeRow) -> bool:
@@ -396,13 +410,22 @@ class LiveOverview:
 #
 # Events of motion are skipped undecoded, so that an episode of a million events is read in seconds.
 
-_READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded"})
+_READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded", "EpisodeTagged"})
 _FAILED = frozenset({"FAILED", "ERROR"})
 _TRIED = frozenset(each.name for each in TRIED)
 _TEXT_MAX = 200
 """Bounds the characters of a description, and of the text of the running nodes."""
 _NODES_IN_FULL = 2
 """Bounds the innermost nodes that are shown with parameters."""
+
+
+class _RunningNode(NamedTuple):
+    """A node that has not ended; `start_ns` is of the monotonic clock."""
+
+    parent: int | None
+    dtype: str
+    is_action: bool
+    start_ns: int
 
 
 class Activity:
@@ -412,32 +435,35 @@ class Activity:
         last: sequence of the last event that was read.
         simulated: True for a simulation, performed in a copy of the world.
         fault: the reason for which its events cannot be read any further, or None.
-        outcomes: of its failures, counted by reason, as far as they were read from the tables.
+        judged: the causes of its failures with their objects and outcomes, from the tables; None until they are read,
+            and again from the next failure on.
     """
 
     def __init__(self, row: EpisodeRow) -> None:
         self.row = row
-        self.outcomes: dict[str, dict[str, int]] = {}
+        self.judged: list[list[Any]] | None = None
         self.last = 0
         self.simulated = False
         self.fault: str | None = None
         self._description = ""
         self._status = "RUNNING"
         self._nodes = self._failed = 0
-        self._parents: dict[int, int | None] = {}
+        self._nodes_running: dict[int, _RunningNode] = {}
         self._running: dict[int, str] = {}
         self._parameters: dict[int, dict[str, Any]] = {}
         """The parameters of the nodes that run, to which those of nodes inside them may refer."""
-        self._actions: dict[int, str] = {}
-        """The types of the running nodes that are actions."""
-        self._tries: dict[str, list[int]] = {}
-        """Successes and tries of actions, by type."""
+        self._tries: dict[str, list[float]] = {}
+        """Successes, tries, ended ones and their seconds, of actions by type."""
         self._latest = ""
         """The action that ended last."""
         self._causes: set[int] = set()
         """The running nodes below which a node failed."""
-        self._reasons: dict[str, int] = {}
+        self._failures: dict[tuple[str, str], list[Any]] = {}
+        """The causes of failures by reason and type, as in the tables, without objects and outcomes."""
+        self._plan = self._commit = ""
+        self._tags: set[str] = set()
         self._robots: dict[str, None] = {}
+        self._objects: dict[str, None] = {}
         self._names: dict[int, str] = {}
         self._start_ns = 0
         self._seconds: float | None = None
@@ -455,21 +481,26 @@ class Activity:
             case EpisodeStarted() as started:
                 self._start_ns = event.monotonic_ns
                 self._description, self.simulated = started.description[:_TEXT_MAX], started.simulated
+                self._plan, self._tags = started.plan or "", set(started.tags)
+                self._commit = commit_text(started.git_commit, is_dirty=started.git_dirty)
+            case EpisodeTagged() as tagged:
+                self._tags = (self._tags | set(tagged.added)) - set(tagged.removed)
             case NodeStarted() as started:
                 self._nodes += 1
                 dtype = designators.get(started.designator or "", "")
                 self._parameters[event.sequence] = whole = with_poses(started.parameters, self._parameters.get)
                 parameters = with_object_names(whole, lambda each: self._names.get(each["object"]))
-                self._parents[event.sequence] = started.parent
-                if started.kind == "action":
-                    self._actions[event.sequence] = dtype
+                node = _RunningNode(started.parent, dtype, started.kind == "action", event.monotonic_ns)
+                self._nodes_running[event.sequence] = node
                 self._running[event.sequence] = f"{dtype or started.kind} {parameters_text(parameters)}".strip()
             case NodeEnded() as ended:
-                self._node_ended(ended)
+                self._node_ended(ended, event.monotonic_ns)
             case ObjectAdded() as added:
                 self._names[event.sequence] = added.name
                 if added.object_type == "ROBOT":
                     self._robots[added.name] = None
+                elif added.object_type != "ENVIRONMENT":
+                    self._objects[added.name] = None
             case EpisodeEnded() as ended_episode:
                 self._status, self._seconds = ended_episode.status, (event.monotonic_ns - self._start_ns) / 1e9
                 if ended_episode.status == "LOST":
@@ -479,50 +510,63 @@ class Activity:
             case _:
                 pass
 
-    def _node_ended(self, ended: NodeEnded) -> None:
+    def _node_ended(self, ended: NodeEnded, now_ns: int) -> None:
         text = self._running.pop(ended.node, "")
         self._parameters.pop(ended.node, None)
-        self._latest = text if ended.node in self._actions else self._latest
-        if (dtype := self._actions.pop(ended.node, None)) is not None and ended.status in _TRIED:
-            tries = self._tries.setdefault(dtype, [0, 0])
+        node = self._nodes_running.pop(ended.node, None)
+        if node is None:
+            return
+        if node.is_action:
+            self._latest = text
+            tries = self._tries.setdefault(node.dtype or "action", [0, 0, 0, 0.0])
             tries[0] += ended.status == "SUCCEEDED"
-            tries[1] += 1
-        parent = self._parents.pop(ended.node, None)
+            tries[1] += ended.status in _TRIED
+            tries[2] += 1
+            tries[3] += (now_ns - node.start_ns) / 1e9
         if ended.status not in _FAILED:
             return
         self._failed += 1
         if ended.node not in self._causes:
             reason = reason_of(ended.failure) if ended.failure is not None else NO_REASON
-            self._reasons[reason] = self._reasons.get(reason, 0) + 1
+            cause = self._failures.setdefault((reason, node.dtype), [reason, node.dtype, "", "open", 0, ended.node])
+            cause[4] += 1
+            self.judged = None
         self._causes.discard(ended.node)
-        if parent is not None:
-            self._causes.add(parent)
+        if node.parent is not None:
+            self._causes.add(node.parent)
 
     @property
     def now(self) -> list[str]:
         """The nodes from the root's child down to the one that started last, the innermost ones with parameters."""
         path: list[str] = []
         node: int | None = max(self._running, default=None)
-        while node is not None and (parent := self._parents.get(node)) is not None:
+        while node is not None and (parent := self._parent_of(node)) is not None:
             text = self._running.get(node, "")
             path.append(text if len(path) < _NODES_IN_FULL else text.partition(" ")[0])
             node = parent
         return [each[:_TEXT_MAX] for each in reversed(path) if each]
 
+    def _parent_of(self, node: int) -> int | None:
+        running = self._nodes_running.get(node)
+        return None if running is None else running.parent
+
     def entry(self) -> dict[str, Any]:
         """Return its row, with the keys of `report.overview`; its times are those of the tables, in µs."""
         return {
             "number": self.row.number,
-            "started": f"{datetime.fromtimestamp(self.row.started_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}",
+            "started": self.row.started_wall_ns // 10**9,
             "description": self._description,
+            "plan": self._plan,
+            "commit": self._commit,
+            "tags": sorted(self._tags),
+            "objects": sorted(self._objects)[:OBJECTS_MAX],
             "status": self._status,
             "seconds": None if self._seconds is None else round(self._seconds, 6),
             "nodes": self._nodes,
             "failed": self._failed,
-            "failed_actions": sum(tries - good for good, tries in self._tries.values()),
-            "actions": {dtype: list(each) for dtype, each in self._tries.items()},
-            "reasons": dict(self._reasons),
-            "outcomes": self.outcomes,
+            "failed_actions": int(sum(tries - good for good, tries, *_ in self._tries.values())),
+            "actions": {dtype: [*each[:3], float(f"{each[3]:.4g}")] for dtype, each in self._tries.items()},
+            "causes": self.judged if self.judged is not None else [[*each] for each in self._failures.values()],
             "page": f"episode/{self.row.number}",
             "unreadable": self.row.refused or self.fault or "",
             "robots": list(self._robots),

@@ -19,7 +19,8 @@ from urllib.parse import quote
 from sqlalchemy import func, select
 
 from pycrorm_async import errors
-from pycrorm_async.orm import RootFailure, TaskTreeNode
+from pycrorm_async.events.ids import row_key
+from pycrorm_async.orm import Object, RootFailure, TaskTreeNode
 from pycrorm_async.query.frames import TRIED, times_with
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.query.question import absence_of_episodes
@@ -28,6 +29,7 @@ from pycrorm_async.query.success import PICK_UPS, Axis, success_samples, success
 from pycrorm_async.report.output_files import refuse_existing, write_file
 from pycrorm_async.report.write import SimilarCases, asset, html_page, page_name, program, report, stream_of
 from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.pose import ObjectType
 
 _PAGES_MAX = 200
 """Bounds the pages behind an overview: one has about 0.7 MB."""
@@ -57,13 +59,15 @@ async def overview(
     """Write a table of all episodes, or of a choice, and pages of the newest 200 of them behind it.
 
     `plots` replace the heat maps of pick-ups; a wrong column or view raises before anything is written.
-    The pages are in the folder `NAME.pages` beside the file `NAME.html`. An episode whose events cannot be read has the
-    reason in its row and no page. Raises `CallerError` if one of the files exists, without `force`, or if there is no
-    such episode.
+    The pages of `NAME.html` are in the folder `NAME.pages` beside it; any other name is that of a folder, which gets
+    `index.html` and the pages. An episode whose events cannot be read has the reason in its row and no page. Raises
+    `CallerError` if one of the files exists, without `force`, or if there is no such episode.
     """
     file = Path(path)
-    folder = file.with_name(f"{file.stem}.pages")
-    refuse_existing(file, force=force)
+    is_page = file.suffix.lower() in (".html", ".htm")
+    folder = file.with_name(f"{file.stem}.pages") if is_page else file
+    refuse_existing(file, force=force, folder=not is_page)
+    file = file if is_page else folder / "index.html"
     if folder.exists() and not (force and folder.is_dir()):
         raise errors.CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
     choice = choice or EpisodeChoice()
@@ -74,11 +78,13 @@ async def overview(
     successes = await success_documents(reading, [each.number for each in episodes], plots)
     with _folder_of_pages(folder):
         shown = episodes[-_PAGES_MAX:]
-        unreadable = await _write_pages(reading, shown, folder, force=force)
+        back = f"../{quote(file.name)}" if is_page else file.name
+        unreadable = await _write_pages(reading, shown, folder, back, force=force)
         shown = [each for each in shown if each.number not in unreadable]
         if unreadable:  # again, because some pages may link to those that are missing
-            await _write_pages(reading, shown, folder, force=True)
-        pages = {each.number: f"{quote(folder.name)}/{page_name(each.number)}" for each in shown}
+            await _write_pages(reading, shown, folder, back, force=True)
+        below = f"{quote(folder.name)}/" if is_page else ""
+        pages = {each.number: f"{below}{page_name(each.number)}" for each in shown}
         document = await overview_document(reading, title, episodes, total, pages, unreadable)
         document["successes"] = successes
         await asyncio.to_thread(lambda: write_file(overview_page_of(document).encode(), file, force=force))
@@ -99,14 +105,15 @@ def _folder_of_pages(folder: Path) -> Iterator[None]:
 
 
 async def _write_pages(
-    reading: Reading, episodes: Collection[EpisodeSummary], folder: Path, *, force: bool
+    reading: Reading, episodes: Collection[EpisodeSummary], folder: Path, back: str, *, force: bool
 ) -> dict[int, str]:
-    """Write a page of each episode, with links to each other; return the reasons why some have none, by number."""
+    """Write a page of each episode, with links to each other and `back`; return why some have none, by number."""
     unreadable: dict[int, str] = {}
     similar = SimilarCases(reading, [each.number for each in episodes])
     for each in episodes:
         try:
-            await report(reading, each, folder / page_name(each.number), force=force, similar=similar)
+            page = folder / page_name(each.number)
+            await report(reading, each, page, force=force, similar=similar, back=back)
         except (errors.LogDamaged, errors.DatabaseForeign) as error:
             unreadable[each.number] = str(error)
         except (errors.PycrormError, OSError):
@@ -116,19 +123,20 @@ async def _write_pages(
     return unreadable
 
 
-MODULES = "dom episode success overview".split()
+MODULES = "dom episode success counts filters groups overview".split()
 """The modules of the page's program, every one behind those that it imports."""
 
 
 def overview_page_of(document: Mapping[str, Any]) -> str:
     """Return the page of a document from `overview_document`."""
+    document = {**document, "episodes": _columns(document["episodes"])}
     scripts = (program(*MODULES, *stream_of(document)),)
     return html_page(document, document["title"], "", asset("web/overview_body.html"), scripts)
 
 
 # === overview data ============================================================================================
 #
-# Collect the episodes of a memory into the document of an overview: outcomes, durations, failures by reason.
+# Collect the episodes of a memory into the document of an overview: what filters choose by, outcomes, times, causes.
 
 _EPISODES_MAX = 20_000
 """Bounds the episodes of an overview: it then has about 5 MB."""
@@ -136,6 +144,8 @@ _DESCRIPTION_MAX = 200
 """Bounds the characters of a description in the table."""
 NO_REASON: Final = "no reason"
 """The name under which failures without a reason are counted."""
+OBJECTS_MAX = 30
+"""Bounds the names of objects of an episode by which it can be chosen."""
 _REASON_MAX = 500
 """Bounds the characters of the reason for which an episode cannot be read."""
 
@@ -164,24 +174,28 @@ async def overview_document(
     `pages` are the addresses of their pages, `unreadable` the reasons why others have none, both by number.
     """
     first = min((each.number for each in episodes), default=0)
-    failures, actions = await failures_by_reason(reading, first=first), await _actions(reading, first)
+    causes, actions = await causes_of(reading, first=first), await _actions(reading, first)
+    objects = await _objects(reading, first)
     return {
         "title": title,
         "total": total,
         "episodes": [
             {
                 "number": each.number,
-                "started": f"{each.started_at:%Y-%m-%d %H:%M:%S}",
+                "started": int(each.started_at.timestamp()),
                 "description": each.description[:_DESCRIPTION_MAX],
                 "status": each.status,
+                "plan": each.plan or "",
+                "commit": commit_text(each.git_commit, is_dirty=each.git_dirty),
                 "robots": [robot.name for robot in each.robots],
+                "tags": [*each.tags],
+                "objects": objects.get(each.number, [])[:OBJECTS_MAX],
                 "seconds": None if each.duration_ns is None else round(each.duration_ns / 1e9, 6),
                 "nodes": each.nodes,
                 "failed": each.failed,
                 "failed_actions": each.failed_actions,
                 "actions": actions.get(each.number, {}),
-                "reasons": {name: sum(each.values()) for name, each in failures.get(each.number, {}).items()},
-                "outcomes": failures.get(each.number, {}),
+                "causes": causes.get(each.number, []),
                 "page": pages.get(each.number),
                 "unreadable": unreadable.get(each.number, "")[:_REASON_MAX],
             }
@@ -190,32 +204,75 @@ async def overview_document(
     }
 
 
-async def failures_by_reason(
+def commit_text(commit: str | None, *, is_dirty: bool | None) -> str:
+    """Return the first digits of a plan's commit, with `+` if the work tree differed from it."""
+    return f"{commit[:10]}{'+' if is_dirty else ''}" if commit else ""
+
+
+def _columns(episodes: Collection[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the entries of episodes as columns, in which texts are numbers of `texts`, for `web/counts.js`."""
+    texts: dict[str, int] = {}
+
+    def packed(value: Any) -> Any:
+        match value:
+            case str():
+                return texts.setdefault(value, len(texts))
+            case list() | tuple():
+                return [*map(packed, value)]
+            case dict():
+                return [packed(each) for pair in value.items() for each in pair]
+        return value
+
+    names = dict.fromkeys(name for each in episodes for name in each)
+    columns = {name: [packed(each.get(name)) for each in episodes] for name in names}
+    return {**columns, "texts": [*texts]}
+
+
+async def causes_of(
     reading: Reading, numbers: Collection[int] | None = None, *, first: int = 0
-) -> dict[int, dict[str, dict[str, int]]]:
-    """Count root failures by episode, reason and outcome: of episodes with these numbers, or from `first` on."""
-    columns = RootFailure.process_metadata_id, RootFailure.reason, RootFailure.outcome
-    query = select(*columns, func.count()).where(columns[0] >= first).group_by(*columns)
+) -> dict[int, list[list[Any]]]:
+    """Count root failures as `failures_by_cause` does, by episode and outcome: of these episodes, or from `first` on.
+
+    A cause is reason, type, object, outcome, the number of failures, and the event at which the first node started.
+    """
+    failure = RootFailure
+    columns = failure.process_metadata_id, failure.reason, failure.dtype, failure.object, failure.outcome
+    query = select(*columns, func.count(), func.min(failure.id)).where(columns[0] >= first).group_by(*columns)
     if numbers is not None:
-        query = query.where(RootFailure.process_metadata_id.in_(numbers))
-    counts: dict[int, dict[str, dict[str, int]]] = {}
-    for number, reason, outcome, count in await reading.rows(query):
-        counts.setdefault(number, {}).setdefault(reason or NO_REASON, {})[outcome] = count
-    return counts
+        query = query.where(failure.process_metadata_id.in_(numbers))
+    causes: dict[int, list[list[Any]]] = {}
+    for number, reason, dtype, object_name, outcome, count, node in await reading.rows(query):
+        cause = [reason or NO_REASON, dtype or "", object_name or "", outcome, count, row_key(node).sequence]
+        causes.setdefault(number, []).append(cause)
+    return causes
 
 
-async def _actions(reading: Reading, first: int) -> dict[int, dict[str, list[int]]]:
-    """Count successes and tries of the actions of each episode from the number `first` on, by type."""
+async def _actions(reading: Reading, first: int) -> dict[int, dict[str, list[float]]]:
+    """Count the actions of each episode from the number `first` on, by type: successes, tries, ended, and their s."""
     node = TaskTreeNode
     counted = times_with(node.status == TaskStatus.SUCCEEDED), times_with(node.status.in_(TRIED))
+    timed = func.count(node.end_ns), func.coalesce(func.sum(node.duration), 0)
     name = func.coalesce(node.dtype, node.kind)  # another executive may report an action without a type
-    query = select(node.process_metadata_id, name, *counted).where(
+    query = select(node.process_metadata_id, name, *counted, *timed).where(
         node.kind == "action", node.process_metadata_id >= first
     )
-    actions: dict[int, dict[str, list[int]]] = {}
-    for number, dtype, *counts in await reading.rows(query.group_by(node.process_metadata_id, name)):
-        actions.setdefault(number, {})[dtype] = counts
+    actions: dict[int, dict[str, list[float]]] = {}
+    for number, dtype, good, tries, ended, seconds in await reading.rows(
+        query.group_by(node.process_metadata_id, name)
+    ):
+        actions.setdefault(number, {})[dtype] = [good, tries, ended, float(f"{seconds:.4g}")]
     return actions
+
+
+async def _objects(reading: Reading, first: int) -> dict[int, list[str]]:
+    """Return the names of the objects of each episode from the number `first` on, without robots and environments."""
+    was_added = Object.id == Object.identity_id, Object.process_metadata_id >= first
+    query = select(Object.process_metadata_id, Object.name, Object.obj_type).where(*was_added).distinct()
+    names: dict[int, list[str]] = {}
+    for number, name, object_type in await reading.rows(query.order_by(Object.process_metadata_id, Object.name)):
+        if object_type not in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
+            names.setdefault(number, []).append(name)
+    return names
 
 
 # === success data =============================================================================================

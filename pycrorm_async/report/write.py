@@ -61,6 +61,7 @@ async def report(
     first: int | None = None,
     last: int | None = None,
     similar: SimilarCases | None = None,
+    back: str = "",
 ) -> Report:
     """Write an episode as one HTML file that opens offline, and return the file and the events that it shows.
 
@@ -72,6 +73,7 @@ async def report(
         first, last: sequences of the first and the last event to show; all by default, up to 100,000 nodes
             or 200,000 moves.
         similar: the cases of the memory, which an overview reads once for all its pages.
+        back: address of the overview, to which the page links.
 
     Raises `UnknownEpisode`; `CallerError` if the file exists or cannot have this name, or if no event is in the window;
     `LogDamaged` or `DatabaseForeign` for an event that cannot be read; `OSError` if the disk is full.
@@ -83,6 +85,7 @@ async def report(
     document["outcomes"] = await outcomes_of(reading, document["episode"]["number"])
     similar = similar or SimilarCases(reading)
     document["similar"] = await similar.document(document["episode"]["number"], document["nodes"][0])
+    document["episode"]["overview"] = back
     file = Path(path) if path is not None else Path(page_name(document["episode"]["number"]))
     await asyncio.to_thread(lambda: write_file(page_of(document).encode(), file, force=force))
     shown = document["episode"]

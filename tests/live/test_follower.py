@@ -82,10 +82,14 @@ async def test_a_listener_gets_each_part_once_and_the_list_what_runs(database_ur
         async with Reading.open(database_url) as reading:
             episodes, total = await newest_episodes(reading)
             tables = await overview_document(reading, "Episodes", episodes, total, {}, {})
-    keys = ("number", "started", "description", "status", "seconds", "nodes", "failed", "reasons")
+    keys = ("number", "started", "description", "status", "seconds", "nodes", "failed", "causes")
     [live], [kept] = list_of["episodes"], tables["episodes"]
     assert {key: live[key] for key in keys} == {key: kept[key] for key in keys}
-    assert (live["status"], live["failed"], live["reasons"]) == ("SUCCEEDED", 1, {"slipped": 1})
+    assert (live["status"], live["failed"], live["causes"]) == (
+        "SUCCEEDED",
+        1,
+        [["slipped", "DriveAction", "", "ignored", 1, 4]],
+    )
 
 
 async def test_a_replaced_database_begins_a_new_epoch(tmp_path: Path) -> None:

@@ -74,7 +74,10 @@ async def test_a_page_follows_a_whole_plan_of_another_process_to_its_end(
             )
             assert page.problems() == []
         cockpit.wait_for("document.querySelector('#episodes tbody').textContent.includes('SUCCEEDED')")
-        cockpit.wait_for("document.querySelector('#reasons tr').textContent === '1IKError 1 recovered'")
+        cockpit.wait_for(
+            "document.querySelector('#reasons tr').textContent.startsWith('1IKError in ')"
+            " && document.querySelector('#reasons tr').textContent.includes('1 recovered')"
+        )
         assert cockpit.problems() == []
     async with Reading.open(f"sqlite:///{tmp_path / 'pycrorm.db'}") as reading:
         whole = await episode_document(reading, 1)

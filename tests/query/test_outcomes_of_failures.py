@@ -150,15 +150,16 @@ async def test_questions_pages_agents_and_recall_give_the_same_outcomes_and_rate
         document = await overview_document(reading, "Episodes", episodes, total, {}, {})
         shown = Counter[str]()
         for each in document["episodes"]:
-            assert sum(each["reasons"].values()) == sum(map(sum, (o.values() for o in each["outcomes"].values())))
-            for outcomes in each["outcomes"].values():
-                shown.update(outcomes)
-            of_nodes = await outcomes_of(reading, each["number"])
-            assert Counter(of_nodes.values()) == sum(map(Counter, each["outcomes"].values()), Counter())
+            of_episode = Counter[str]()
+            for *_, outcome, count, event in each["causes"]:
+                of_episode[outcome] += count
+                assert (await outcomes_of(reading, each["number"]))[str(event)] == outcome
+            assert Counter((await outcomes_of(reading, each["number"])).values()) == of_episode
+            shown += of_episode
         assert shown == expected
         rates = {each.dtype: each for each in await reading.ask.success_rates().rows()}
         for dtype, rate in rates.items():
-            tries = [each["actions"].get(dtype, [0, 0]) for each in document["episodes"]]
+            tries = [each["actions"].get(dtype, [0, 0])[:2] for each in document["episodes"]]
             good, tried = map(sum, zip(*tries, strict=True))
             assert (rate.succeeded, rate.succeeded + rate.failed) == (good, tried)
             assert (rate.low, rate.high) == pytest.approx(interval_95(good, tried))
@@ -194,9 +195,15 @@ async def test_the_live_list_counts_what_the_tables_count(database_url: str, tmp
     async with Reading.open(database_url) as reading:
         episodes, total = await newest_episodes(reading)
         kept = (await overview_document(reading, "Episodes", episodes, total, {}, {}))["episodes"]
-    keys = "status", "failed", "failed_actions", "actions", "reasons", "outcomes"
+    keys = "status", "failed", "failed_actions", "causes", "plan", "commit", "tags", "objects"
     assert [{key: each[key] for key in keys} for each in live] == [{key: each[key] for key in keys} for each in kept]
-    assert [each["outcomes"]["Slip"] for each in live] == [{"ignored": 1}, {"recovered": 1}, {"recovered": 1}]
+    counts = [{dtype: each[:3] for dtype, each in entry["actions"].items()} for entry in (*live, *kept)]
+    assert counts[: len(live)] == counts[len(live) :]
+    assert [cause[3:5] for each in live for cause in each["causes"]] == [
+        ["ignored", 1],
+        ["recovered", 1],
+        ["recovered", 1],
+    ]
 
 
 def test_an_episode_says_how_many_of_its_actions_failed_beside_its_own_status(tmp_path: Path) -> None:

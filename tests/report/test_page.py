@@ -243,7 +243,7 @@ def test_a_table_of_episodes_counts_failures_by_reason_and_leads_to_the_pages(
             "✓ SUCCEEDED, 2 actions failed",
         ]
         assert tab.ask(rows.format("#reasons", 0)) == ["4"]
-        assert tab.ask(rows.format("#reasons", 1)) == ["IKError 2 recovered, 2 failed"]
+        assert tab.ask(rows.format("#reasons", 1)) == ["IKError in MoveTCPMotion with milk 2 recovered, 2 failed 2 1"]
         assert "67 % of 3 (21 to 94 %) succeeded" in tab.ask("document.getElementById('facts').textContent")
         heading = tab.ask("document.querySelector('#success h2').textContent")
         assert heading == "Pick-ups: 20 % of 5 (4 to 62 %) succeeded"

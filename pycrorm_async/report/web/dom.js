@@ -51,4 +51,10 @@ export function duration(seconds) {
   return `${(seconds * 1e6).toFixed(0)} µs`;
 }
 
+/** The address of the overview with the settings that it had when it led to this page. */
+export function backTo(overview) {
+  const settings = new URLSearchParams(location.search).get("list");
+  return settings ? `${overview}#${settings}` : overview;
+}
+
 export const colorOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

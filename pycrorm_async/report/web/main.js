@@ -1,7 +1,7 @@
 // Puts the page together: one moment, `event`, that the tree, the scene, the chart and the panels show.
 
 import { Bodies, pathsOf } from "./bodies.js";
-import { duration, element, recorded, strokeOf, svg } from "./dom.js";
+import { backTo, duration, element, recorded, strokeOf, svg } from "./dom.js";
 import { Episode, signOf } from "./episode.js";
 import { GanttView } from "./gantt_view.js";
 import { MapView } from "./map_view.js";
@@ -78,7 +78,8 @@ class Page {
       episode.tags.length > 0 ? episode.tags.join(", ") : null,
       whole ? null : `events ${episode.first} to ${episode.last} of ${episode.head}`,
     ].filter((each) => each !== null);
-    part("facts").replaceChildren(...facts.map((each) => recorded(each)));
+    const list = episode.overview ? element("a", { href: backTo(episode.overview) }, "all episodes") : "";
+    part("facts").replaceChildren(list, ...facts.map((each) => recorded(each)));
     const notes = this.#assumptions().slice(0, NOTES_MAX).map((each) => element("p", {}, recorded(each)));
     document.body.classList.toggle("no-objects", episode.objects.length === 0);
     if (episode.objects.length === 0) notes.push(element("p", {}, "This episode recorded no objects: there is no scene to draw."));

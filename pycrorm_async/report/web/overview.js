@@ -1,32 +1,21 @@
 // Shows many episodes: how often they succeed and for how long, why they fail, and a table that leads to their pages.
 
+import { actionsOf, causesOf, entriesOf, secondsOf, shareOf, triesOf } from "./counts.js";
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { signOf } from "./episode.js";
+import { Filters, Settings } from "./filters.js";
+import { Groups, intervalPicture } from "./groups.js";
 import { interval95, rateText, successMap } from "./success.js";
 
 const BINS_MAX = 12;
-const REASONS_MAX = 20;
+const CAUSES_MAX = 15;
 const ACTIONS_MAX = 20;
-const ROWS_MAX = 2000;
+const ROWS_AT_ONCE = 100; // with them a filter is drawn in 0.1 s
+const LINKS_MAX = 3;
+const SPREAD = 30; // from so many times the shortest duration on, the bars of durations grow by a factor
 
 const part = (name) => document.getElementById(name);
-/** The episodes that ended, and of which it is known how. */
-const ended = (episodes) => episodes.filter((each) => each.status !== "RUNNING" && each.status !== "UNKNOWN");
-const succeeded = (episodes) => ended(episodes).filter((each) => each.status === "SUCCEEDED").length;
-const rateOf = (episodes) => (ended(episodes).length === 0 ? null : succeeded(episodes) / ended(episodes).length);
 const percent = (rate) => `${(rate * 100).toFixed(0)} %`;
-
-/** Add up counts by name, the greatest first. */
-function sumsOf(maps) {
-  const sums = new Map();
-  for (const map of maps) for (const [name, count] of Object.entries(map)) sums.set(name, (sums.get(name) ?? 0) + count);
-  return [...sums].sort(([, one], [, other]) => other - one);
-}
-
-function median(numbers) {
-  const sorted = numbers.filter((each) => each !== null).sort((one, other) => one - other);
-  return sorted.length === 0 ? null : sorted[Math.floor(sorted.length / 2)];
-}
 
 /** The episodes in their order, in parts of equal size. */
 function binsOf(episodes) {
@@ -75,7 +64,12 @@ function failedActions({ status, failed_actions: failed = 0 }) {
 
 class Overview {
   constructor({ title, total, episodes, successes = [] }) {
-    Object.assign(this, { title, total, episodes, by: "number", down: true });
+    const entries = entriesOf(episodes);
+    this.settings = new Settings(() => this.#draw());
+    this.filters = new Filters(part("filters"), this.settings);
+    this.groups = new Groups(part("groups"), this.settings);
+    Object.assign(this, { title, total, episodes: entries, rows: ROWS_AT_ONCE });
+    this.filters.offer(entries);
     if (successes.length > 0) {
       const sources = [...new Set(successes.map(({ of }) => of))];
       const parts = sources.map((of) => mapsOf(of, successes.filter((each) => each.of === of)));
@@ -87,38 +81,47 @@ class Overview {
   /** Take in the entries of episodes that are new or have changed. */
   extend(...parts) {
     const entries = new Map(this.episodes.map((each) => [each.number, each]));
-    for (const { episodes } of parts) for (const each of episodes) entries.set(each.number, each);
+    for (const { episodes } of parts) for (const each of entriesOf(episodes)) entries.set(each.number, each);
     this.total += entries.size - this.episodes.length;
     this.episodes = [...entries.values()].sort((one, other) => one.number - other.number);
+    this.filters.offer(this.episodes);
     this.#draw();
   }
 
   #draw() {
     const { episodes, total } = this;
-    const middle = median(episodes.map((each) => each.seconds));
+    this.filters.show();
+    this.chosen = this.filters.chosen(episodes);
+    const { chosen } = this;
+    const [good, tries] = triesOf(chosen);
+    const middle = secondsOf(chosen);
+    const count = `${chosen.length} episode${chosen.length === 1 ? "" : "s"}`;
     const facts = [
-      `${episodes.length} episode${episodes.length === 1 ? "" : "s"}`,
-      ended(episodes).length > 0 ? `${rateText(succeeded(episodes), ended(episodes).length)} succeeded` : null,
+      chosen.length < episodes.length ? `${count} of ${episodes.length}` : count,
+      tries > 0 ? `${rateText(good, tries)} succeeded` : null,
       middle === null ? null : `median ${duration(middle)}`,
-      total > episodes.length ? `the newest of ${total}` : null,
+      total > episodes.length ? `the newest ${episodes.length} of ${total}` : null,
     ];
     part("facts").replaceChildren(...facts.filter((each) => each !== null).map((each) => recorded(each)));
-    this.bins = binsOf(episodes);
+    part("success").classList.toggle("later", chosen.length < episodes.length);
+    this.bins = binsOf(chosen);
     this.#running();
+    this.groups.show(chosen);
     this.#trend();
+    this.#durations();
     this.#actions();
-    this.#reasons();
+    this.#causes();
     this.#table();
   }
 
   /** What each running episode does now; a file has none, because it cannot follow them. */
   #running() {
-    const running = this.episodes.filter((each) => each.status === "RUNNING" && each.now !== undefined);
+    const running = this.chosen.filter((each) => each.status === "RUNNING" && each.now != null);
     const rows = running.map((each) =>
       element(
         "li",
         {},
-        element("a", { href: each.page }, recorded(each.robots.join(", ") || `episode ${each.number}`)),
+        element("a", { href: this.settings.addressOf(each.page) }, recorded(each.robots.join(", ") || `episode ${each.number}`)),
         " ",
         recorded(each.description, { class: "quiet" }),
         element("ol", { class: "now" }, ...each.now.map((node) => element("li", {}, recorded(node)))),
@@ -132,92 +135,113 @@ class Overview {
   }
 
   #trend() {
-    const rates = this.bins.map(rateOf);
+    const counts = this.bins.map((bin) => triesOf(bin));
+    const rates = counts.map(([good, tries]) => (tries > 0 ? good / tries : null));
     if (rates.length < 2 || rates.every((each) => each === null)) return part("trend").replaceChildren();
-    const counts = this.bins.map((bin) => [succeeded(bin), ended(bin).length]);
     const picture = bars(rates, 1, "share of successful episodes, the oldest first", percent, counts);
     return part("trend").replaceChildren(element("h2", {}, "Success, the oldest episodes first"), picture);
   }
 
+  /** How many episodes took how long. */
+  #durations() {
+    const seconds = this.chosen.map((each) => each.seconds).filter((each) => each !== null);
+    const [least, most] = [shareOf(seconds, 0), shareOf(seconds, 1)];
+    if (seconds.length < 2 || least === most) return part("durations").replaceChildren();
+    const scale = least > 0 && most > SPREAD * least ? Math.log : (each) => each;
+    const bins = Array.from({ length: BINS_MAX }, () => 0);
+    const width = (scale(most) - scale(least)) / BINS_MAX;
+    for (const each of seconds) bins[Math.min(Math.floor((scale(each) - scale(least)) / width), BINS_MAX - 1)] += 1;
+    const picture = bars(bins, Math.max(...bins), "number of episodes by duration, the shortest first", String);
+    const text = `From ${duration(least)} to ${duration(most)}${scale === Math.log ? ", in equal factors" : ""}; nine of ten within ${duration(shareOf(seconds, 0.9))}.`;
+    return part("durations").replaceChildren(element("h2", {}, "Durations"), picture, element("p", { class: "quiet" }, text));
+  }
+
   /** How often the actions of each type succeeded; an episode may succeed although some of them failed. */
   #actions() {
-    const all = this.episodes.map(({ actions = {} }) => Object.entries(actions));
-    const good = new Map(sumsOf(all.map((each) => Object.fromEntries(each.map(([type, [count]]) => [type, count])))));
-    const tries = sumsOf(all.map((each) => Object.fromEntries(each.map(([type, [, count]]) => [type, count]))));
-    const rows = tries.filter(([, count]) => count > 0).slice(0, ACTIONS_MAX).map(([type, count]) => {
-      const failed = count - good.get(type);
-      const cells = [element("td", { class: "named" }, recorded(type)), element("td", { class: "fixed" }, rateText(good.get(type), count))];
-      return element("tr", {}, ...cells, element("td", { class: "number" }, failed > 0 ? `${failed} failed` : ""));
+    const types = [...actionsOf(this.chosen)].filter(([, [, tries]]) => tries > 0).slice(0, ACTIONS_MAX);
+    const rows = types.map(([type, [good, tries, count, seconds]]) => {
+      const name = element("button", { type: "button", class: "link", title: "group by its success", onclick: () => this.settings.set({ of: type, by: this.settings.get("by") || "week" }) }, recorded(type));
+      const cells = [element("td", { class: "named" }, name), element("td", { class: "fixed" }, rateText(good, tries), intervalPicture(good, tries))];
+      return element("tr", {}, ...cells, element("td", { class: "number", title: "mean time" }, count > 0 ? duration(seconds / count) : ""));
     });
     part("actions").replaceChildren(...(rows.length > 0 ? [element("h2", {}, "Success of actions"), element("table", {}, ...rows)] : []));
   }
 
-  #reasons() {
-    const sorted = sumsOf(this.episodes.map(({ reasons }) => reasons));
-    const rows = sorted.slice(0, REASONS_MAX).map(([reason, count]) => {
-      const trend = this.bins.map((bin) => bin.reduce((sum, each) => sum + (each.reasons[reason] ?? 0), 0));
-      const picture = this.bins.length > 1 ? bars(trend, Math.max(...trend), `${reason} over time`, String) : "";
-      const outcomes = sumsOf(this.episodes.map((each) => each.outcomes?.[reason] ?? {})).filter(([name]) => name !== "open");
+  /** Why actions failed, with links to the newest episodes in which they did. */
+  #causes() {
+    const causes = causesOf(this.chosen);
+    const binOf = new Map(this.bins.flatMap((bin, index) => bin.map((each) => [each, index])));
+    const rows = causes.slice(0, CAUSES_MAX).map((cause) => {
+      const trend = this.bins.map(() => 0);
+      for (const [episode] of cause.at) trend[binOf.get(episode)] += 1;
+      const picture = this.bins.length > 1 ? bars(trend, Math.max(...trend), `${cause.name}: episodes over time`, String) : "";
+      const outcomes = [...cause.outcomes].filter(([name]) => name !== "open" && name !== "").sort(([, one], [, other]) => other - one);
       const after = element("span", { class: "quiet" }, outcomes.map(([name, number]) => ` ${number} ${name}`).join(","));
-      const named = element("td", { class: "named" }, recorded(reason, { class: "reason" }), after);
-      const cells = [element("td", { class: "number" }, String(count)), named];
+      const only = () => this.settings.set({ cause: cause.name });
+      const name = element("button", { type: "button", class: "link reason", title: "show only these episodes", onclick: only }, recorded(cause.reason));
+      const where = [cause.type && ` in ${cause.type}`, cause.object && ` with ${cause.object}`].filter(Boolean).map((each) => recorded(each));
+      const newest = cause.at.filter(([{ page }]) => page).slice(-LINKS_MAX).reverse();
+      const links = newest.flatMap(([{ number, page }, event]) => [" ", element("a", { href: this.settings.addressOf(page, event) }, `${number}`)]);
+      const cells = [element("td", { class: "number" }, String(cause.count)), element("td", { class: "named" }, name, ...where, after, ...links)];
       return element("tr", {}, ...cells, element("td", {}, picture));
     });
-    const left = sorted.length - rows.length;
+    const left = causes.length - rows.length;
     const content = rows.length > 0 ? element("table", {}, ...rows) : element("p", { class: "quiet" }, "Nothing failed.");
-    part("reasons").replaceChildren(element("h2", {}, "Failures by reason"), content);
-    if (left > 0) part("reasons").append(element("p", { class: "quiet" }, `${left} other reasons`));
+    part("reasons").replaceChildren(element("h2", {}, "Failures by cause"), content);
+    if (left > 0) part("reasons").append(element("p", { class: "quiet" }, `${left} other causes`));
   }
 
   #table() {
+    const by = this.settings.get("sort") || "number";
+    const down = this.settings.get("up") === "";
     const robots = this.episodes.some((each) => each.robots?.length > 0) ? { robots: "robots" } : {};
     const columns = { number: "episode", started: "started (UTC)", status: "status", seconds: "took", nodes: "nodes", failed: "failed", ...robots, description: "description" };
     this.named = "robots" in columns;
     const heads = Object.entries(columns).map(([key, title]) => {
-      const sign = this.by === key ? (this.down ? " ▾" : " ▴") : "";
-      const sort = { type: "button", "data-key": key, onclick: () => this.#sortBy(key) };
-      const order = this.by === key ? (this.down ? "descending" : "ascending") : null;
+      const sign = by === key ? (down ? " ▾" : " ▴") : "";
+      const sort = { type: "button", "data-key": key, onclick: () => this.settings.set({ sort: key, up: by === key && down ? "1" : "" }) };
+      const order = by === key ? (down ? "descending" : "ascending") : null;
       return element("th", { scope: "col", "aria-sort": order }, element("button", sort, `${title}${sign}`));
     });
-    const order = this.down ? -1 : 1;
-    const sorted = this.episodes.slice().sort((one, other) => {
-      const [a, b] = [one, other].map((each) => (Array.isArray(each[this.by]) ? each[this.by].join() : each[this.by] ?? -1));
-      return (a < b ? -1 : a > b ? 1 : 0) * order;
-    });
-    const rows = sorted.slice(0, ROWS_MAX).map((each) => this.#row(each));
+    const order = down ? -1 : 1;
+    const valueOf = (each) => (Array.isArray(each[by]) ? each[by].join() : each[by] ?? -1);
+    const sorted = this.chosen.map((each) => [valueOf(each), each]).sort(([one], [other]) => (one < other ? -1 : one > other ? 1 : 0) * order);
+    const rows = sorted.slice(0, this.rows).map(([, each]) => this.#row(each));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows));
     const left = sorted.length - rows.length;
-    const note = left > 0 ? element("p", { class: "quiet" }, `${left} more episodes are counted above and not listed.`) : "";
-    const missing = this.episodes.filter((each) => !each.page && !each.unreadable).map((each) => each.number);
+    const more = element("button", { type: "button", onclick: () => this.#listMore() }, `list ${Math.min(left, this.rows)} more of ${left}`);
+    const missing = this.chosen.filter((each) => !each.page && !each.unreadable).map((each) => each.number);
     const command = element("code", {}, `pycrorm report ${missing.length > 0 ? Math.max(...missing) : ""}`);
     const text = `${missing.length} older episodes have no page here. One of them gets a page of its own by `;
-    replaceIn(part("episodes"), element("h2", {}, "Episodes"), table, note, missing.length > 0 ? element("p", { class: "quiet" }, text, command) : "");
+    const none = rows.length === 0 ? element("p", { class: "quiet" }, this.episodes.length > 0 ? "No episode fulfils all conditions." : "There is no episode yet.") : "";
+    replaceIn(part("episodes"), element("h2", {}, "Episodes"), rows.length > 0 ? table : none, left > 0 ? more : "", missing.length > 0 ? element("p", { class: "quiet" }, text, command) : "");
+  }
+
+  #listMore() {
+    this.rows *= 2;
+    this.#table();
   }
 
   #row(each) {
     const name = String(each.number);
+    const started = new Date(each.started * 1000).toISOString().replace("T", " ").slice(0, 19);
+    const tags = (each.tags ?? []).map((tag) => recorded(tag, { class: "count" }));
     return element(
       "tr",
       {},
-      element("td", { class: "number" }, each.page ? element("a", { href: each.page }, name) : name, this.#missing(each)),
-      element("td", { class: "fixed" }, each.started),
+      element("td", { class: "number" }, each.page ? element("a", { href: this.settings.addressOf(each.page) }, name) : name, this.#missing(each)),
+      element("td", { class: "fixed" }, started),
       element("td", { class: `fixed is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`, failedActions(each)),
       element("td", { class: "number" }, each.seconds === null ? "" : duration(each.seconds)),
       element("td", { class: "number", "data-name": "nodes" }, String(each.nodes)),
       element("td", { class: "number", "data-name": "failed" }, String(each.failed)),
       this.named ? element("td", {}, recorded((each.robots ?? []).join(", "))) : null,
-      element("td", { class: "wide" }, recorded(each.description), each.unreadable ? unreadable(each.unreadable) : null),
+      element("td", { class: "wide" }, recorded(each.description), ...tags, each.unreadable ? unreadable(each.unreadable) : null),
     );
   }
 
   #missing({ page, unreadable: fault }) {
     return page || fault ? null : element("span", { class: "quiet" }, " no page");
-  }
-
-  #sortBy(key) {
-    this.down = this.by === key ? !this.down : true;
-    this.by = key;
-    this.#table();
   }
 }
 

@@ -1,6 +1,6 @@
 // Follows the server of a live page: gives its parts to the page, and shows it when the server or the database is away.
 
-import { element, recorded } from "./dom.js";
+import { backTo, element, recorded } from "./dom.js";
 
 const SILENCE_S = 8;
 const RETRY_MS = 1000;
@@ -15,7 +15,7 @@ class Stream {
     this.note = element("p", { class: "quiet", id: "stream" });
     holder.querySelector("h1").after(this.badge);
     holder.append(this.note);
-    if (live.list) this.note.before(element("a", { href: live.list }, "all episodes"));
+    if (live.list) this.note.before(element("a", { href: backTo(live.list) }, "all episodes"));
     this.badge.addEventListener("click", () => this.view.follow?.(!this.view.following));
     this.view.onFollow = () => this.#show();
     this.connected = null; // until the server answers, or cannot be reached

@@ -1,0 +1,150 @@
+// Groups episodes by robot, plan, week or software version, with the success of each group, and compares two of them.
+
+import { actionsOf, causesOf, differenceOf, secondsOf, triesOf } from "./counts.js";
+import { duration, element, recorded, svg } from "./dom.js";
+import { FACETS } from "./filters.js";
+import { interval95, rateText } from "./success.js";
+
+const GROUPS_MAX = 60;
+const TYPES_MAX = 15;
+const COMPARED_CAUSES_MAX = 12;
+const DAY_MS = 86_400_000;
+
+const dayOf = ({ started }) => new Date(started * 1000).toISOString().slice(0, 10);
+
+/** The Monday of the week of an episode, UTC. */
+function weekOf({ started }) {
+  const day = new Date(started * 1000);
+  return new Date(day.getTime() - ((day.getUTCDay() + 6) % 7) * DAY_MS).toISOString().slice(0, 10);
+}
+
+const IN_TIME = { week: (each) => [weekOf(each)], day: (each) => [dayOf(each)], version: FACETS.version };
+const GROUPINGS = { ...FACETS, ...IN_TIME };
+const NO_VALUE = "none";
+
+/** Episodes by group: those of time and of versions in the order of time, others the largest first. */
+function groupsOf(episodes, by) {
+  const groups = new Map();
+  for (const each of episodes) {
+    const names = GROUPINGS[by](each);
+    for (const name of names.length > 0 ? names : [NO_VALUE]) {
+      if (!groups.has(name)) groups.set(name, []);
+      groups.get(name).push(each);
+    }
+  }
+  const sorted = [...groups];
+  if (by === "version") return sorted;
+  return by in IN_TIME ? sorted.sort(([one], [other]) => (one < other ? -1 : 1)) : sorted.sort(([, one], [, other]) => other.length - one.length);
+}
+
+/** A share of successes as a point on a line from 0 to 100 %, and its interval around it. */
+export function intervalPicture(good, tries) {
+  const [wide, middle, edge] = [120, 7, 4];
+  const at = (share) => edge + share * (wide - 2 * edge);
+  const picture = svg("svg", { viewBox: `0 0 ${wide} 14`, class: "interval-line", role: "img", "aria-label": tries > 0 ? rateText(good, tries) : "no try" });
+  picture.append(svg("line", { x1: at(0), x2: at(1), y1: middle, y2: middle, class: "axis" }));
+  if (tries === 0) return picture;
+  const [low, high] = interval95(good, tries);
+  picture.append(svg("line", { x1: at(low), x2: at(high), y1: middle, y2: middle, class: "spread" }));
+  picture.append(svg("circle", { cx: at(good / tries), cy: middle, r: 3.5 }), svg("title", {}, rateText(good, tries)));
+  return picture;
+}
+
+const choice = (label, values, value, onChoose) => {
+  const select = element("select", { "aria-label": label });
+  select.append(...values.map(([each, text]) => element("option", { value: each }, text)));
+  select.value = value;
+  select.addEventListener("input", () => onChoose(select.value));
+  return select;
+};
+
+export class Groups {
+  constructor(holder, settings) {
+    Object.assign(this, { holder, settings });
+  }
+
+  show(episodes) {
+    const { settings } = this;
+    const by = settings.get("by") in GROUPINGS ? settings.get("by") : "";
+    const kinds = Object.keys(GROUPINGS).filter((each) => each === by || each in IN_TIME || episodes.some((other) => GROUPINGS[each](other).length > 0));
+    const groupings = [["", "no groups"], ...kinds.map((each) => [each, `by ${each}`])];
+    const head = element("h2", {}, "Groups ", choice("group by", groupings, by, (value) => settings.set({ by: value, vs: [] })));
+    if (by === "") return this.holder.replaceChildren(head);
+    const types = [...actionsOf(episodes).keys()];
+    const type = settings.get("of");
+    if (type && !types.includes(type)) types.push(type);
+    head.append(" success of ", choice("success of", [["", "episodes"], ...types.map((each) => [each, each])], type, (value) => settings.set({ of: value })));
+    const groups = groupsOf(episodes, by);
+    const shown = by in IN_TIME ? groups.slice(-GROUPS_MAX) : groups.slice(0, GROUPS_MAX);
+    const chosen = settings.values.getAll("vs");
+    const rows = shown.map(([name, members]) => this.#row(by, name, members, type, chosen));
+    const took = type === "" ? "median time" : "mean time";
+    const titles = ["", by, "episodes", type === "" ? "succeeded" : "succeeded, of tries", took];
+    const table = element("table", {}, element("thead", {}, element("tr", {}, ...titles.map((each) => element("th", { scope: "col" }, each)))), element("tbody", {}, ...rows));
+    const left = groups.length - shown.length;
+    const notes = [left > 0 ? `${left} other groups. ` : "", chosen.length < 2 ? "Mark two groups to compare them." : ""].join("");
+    const compared = chosen.length === 2 ? comparison(chosen.map((name) => [name, new Map(groups).get(name) ?? []])) : [];
+    return this.holder.replaceChildren(head, table, element("p", { class: "quiet" }, notes), ...compared);
+  }
+
+  #row(by, name, members, type, chosen) {
+    const [good, tries] = triesOf(members, type);
+    const seconds = secondsOf(members, type);
+    const mark = element("input", { type: "checkbox", "aria-label": `compare ${name}` });
+    mark.checked = chosen.includes(name);
+    mark.addEventListener("input", () => {
+      const others = chosen.filter((each) => each !== name);
+      this.settings.set({ vs: mark.checked ? [...others.slice(-1), name] : others });
+    });
+    const filter = by === "week" ? { from: name, to: lastDayOf(name) } : by === "day" ? { from: name, to: name } : { [by]: name };
+    const only = element("button", { type: "button", class: "link", title: "show only these", onclick: () => this.settings.set({ ...filter, vs: [] }) }, recorded(name));
+    return element(
+      "tr",
+      {},
+      element("td", {}, mark),
+      element("td", {}, name === NO_VALUE ? element("span", { class: "quiet" }, "none") : only),
+      element("td", { class: "number" }, String(members.length)),
+      element("td", { class: "fixed" }, tries > 0 ? rateText(good, tries) : "–", intervalPicture(good, tries)),
+      element("td", { class: "number" }, seconds === null ? "" : duration(seconds)),
+    );
+  }
+}
+
+const lastDayOf = (monday) => new Date(Date.parse(`${monday}T00:00Z`) + 6 * DAY_MS).toISOString().slice(0, 10);
+
+/** Two groups side by side: success and time of the episodes and of each type of action, and how often each cause was met. */
+function comparison([[name, one], [otherName, other]]) {
+  const sides = [new Set(one), new Set(other)];
+  const all = [...new Set([...one, ...other])];
+  const types = ["", ...[...actionsOf(all).keys()].slice(0, TYPES_MAX)];
+  const rows = types.map((type) => {
+    const tries = [one, other].map((each) => triesOf(each, type));
+    const seconds = [one, other].map((each) => secondsOf(each, type));
+    const cells = tries.map(([good, count], index) => element("td", { class: "fixed" }, count > 0 ? `${percentOf(good / count)} of ${count}` : "–", element("span", { class: "quiet" }, seconds[index] === null ? "" : `, ${duration(seconds[index])}`)));
+    return element("tr", {}, element("td", {}, type === "" ? "episodes" : recorded(type)), ...cells, differenceCell(differenceOf(...tries)));
+  });
+  const causes = causesOf(all).slice(0, COMPARED_CAUSES_MAX).map((cause) => {
+    const shares = sides.map((members) => [cause.at.filter(([episode]) => members.has(episode)).length, members.size]);
+    const cells = shares.map(([count, size]) => element("td", { class: "fixed" }, size > 0 ? `${percentOf(count / size)} of ${size}` : "–"));
+    return element("tr", {}, element("td", { class: "named" }, recorded(cause.name, { class: "reason" })), ...cells, differenceCell(differenceOf(...shares), -1));
+  });
+  const heads = (title) => element("thead", {}, element("tr", {}, ...[title, recorded(name), recorded(otherName), "difference"].map((each) => element("th", { scope: "col" }, each))));
+  const note = "The difference is that of the second to the first, with its 95 % interval; it is bold where that leaves out 0. Times are the median of episodes and the mean of actions.";
+  return [
+    element("h3", {}, recorded(name), " beside ", recorded(otherName)),
+    element("div", { class: "scrolled" }, element("table", {}, heads("succeeded"), element("tbody", {}, ...rows), causes.length > 0 ? heads("episodes that failed by") : null, element("tbody", {}, ...causes))),
+    element("p", { class: "quiet" }, note),
+  ];
+}
+
+const percentOf = (rate) => `${Math.round(rate * 100)} %`;
+
+/** A difference in percentage points; `better` is -1 where less is better. */
+function differenceCell(difference, better = 1) {
+  if (difference === null) return element("td", {});
+  const [value, low, high] = difference.map((each) => Math.round(each * 100));
+  const clear = difference[1] > 0 || difference[2] < 0;
+  const signed = (each) => (each > 0 ? `+${each}` : String(each));
+  const classes = clear ? (value * better > 0 ? "fixed better" : "fixed worse") : "fixed quiet";
+  return element("td", { class: classes }, `${signed(value)} (${signed(low)} to ${signed(high)})`);
+}
