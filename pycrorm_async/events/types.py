@@ -78,7 +78,7 @@ class PoseReference(_Value, frozen=True):
     @classmethod
     def of(cls, value: Any) -> PoseReference | None:
         """Return the reference that a parameter is; None if it is none."""
-        if not isinstance(value, dict) or value.keys() != {"pose_of", "field", "slot"}:
+        if not isinstance(value, dict) or "pose_of" not in value or value.keys() != {"pose_of", "field", "slot"}:
             return None
         with suppress(msgspec.ValidationError):
             return msgspec.convert(value, cls)

@@ -505,11 +505,8 @@ class ProjectedBatch(ABC):
         self, fold: Any, events: Sequence[StoredEvent], happenings: Sequence[Happening | None], *, kept: bool = True
     ) -> Refused | None:
         reads, decoded = self.reads, zip(events, happenings, strict=True)
-        return self.add(
-            fold,
-            ((event, each) for event, each in decoded if each is not None and (reads is None or event.type in reads)),
-            kept=kept,
-        )
+        read = [(e, each) for e, each in decoded if each is not None and (reads is None or e.type in reads)]
+        return self.add(fold, read, kept=kept)
 
     @abstractmethod
     def add(self, fold: Any, events: Iterable[tuple[StoredEvent, Happening]], *, kept: bool) -> Refused | None:

@@ -7,8 +7,7 @@ from typing import Any
 from xml.etree.ElementTree import ParseError, fromstring
 
 import msgspec
-import sqlalchemy
-from sqlalchemy import ColumnElement, column, literal_column, select, text
+from sqlalchemy import select, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.codec import UPCASTERS, Decoder, UnknownShape, description_of, fingerprint
@@ -66,6 +65,7 @@ from pycrorm_async.projections.row_batch import (
 from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.schema import SELECT_IDS
 from pycrorm_async.store.stored import Span, StoredEvent
 
 # === fold =====================================================================================================
@@ -472,8 +472,6 @@ def _has_further_links(description: DescriptionDeclared) -> bool:
 # Values are bound or copied and never encoded as JSON, so that every double is stored exactly. `executemany` is not
 # used, because it releases the GIL at every row: next to a busy plan it wrote 872 rows/s, one statement 123,000 rows/s.
 
-_episode = sqlalchemy.table("episode", column("number"))
-
 
 def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> RowsByTable:
     """Rename tables and columns to the names that they have in this database and generation."""
@@ -485,9 +483,7 @@ def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> Rows
 
 async def uuids_of(connection: AsyncConnection, numbers: Collection[int]) -> dict[int, str]:
     """Return the UUIDs of these episodes, by number: their events contain only the number."""
-    identity: ColumnElement[str] = literal_column(dialect_of(connection).episode_id)
-    some = select(_episode.c.number, identity).where(_episode.c.number.in_(numbers))
-    return dict((await connection.execute(some)).all())
+    return dict(await dialect_of(connection).rows(connection, tuple, SELECT_IDS, numbers=[(each,) for each in numbers]))
 
 
 def name_episodes(rows: Rows, uuids: Mapping[int, str]) -> None:

@@ -31,7 +31,24 @@ from itertools import chain
 from typing import Any, Literal, Protocol, TypeAlias
 
 import msgspec
-from sqlalchemy import Dialect, Index, Integer, LargeBinary, Select, Text, column, delete, literal, select, table, text
+from sqlalchemy import (
+    Dialect,
+    Index,
+    Integer,
+    LargeBinary,
+    Select,
+    Text,
+    and_,
+    bindparam,
+    case,
+    column,
+    delete,
+    literal,
+    not_,
+    select,
+    table,
+    text,
+)
 from sqlalchemy.exc import ArgumentError, CompileError, IdentifierError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement
@@ -109,6 +126,25 @@ _notes = table(
     column("layout", Text()),
     column("views", Text()),
 )
+_is_known = and_(
+    _notes.c.generation == bindparam("number"),
+    _notes.c.revision == bindparam("revision"),
+    _notes.c.version == bindparam("of_version"),
+)
+_select_news = select(
+    _notes.c.version,
+    _notes.c.generation,
+    _notes.c.revision,
+    case((not_(_is_known), _notes.c.layout)).label("layout"),
+    case((not_(_is_known), _notes.c.views)).label("views"),
+).where(_notes.c.projection == bindparam("name"))
+_SELECTS: Mapping[Hold | None, Select[Any]] = {
+    None: _select_news,  # SQLite has no row locks and needs none: its write transaction excludes all others
+    "share": _select_news.with_for_update(read=True),
+    "change": _select_news.with_for_update(),
+    "if free": _select_news.with_for_update(read=True, skip_locked=True),
+}
+"""The query of a generation by how its row is locked; layout and views are NULL in that which the caller knows."""
 
 
 @dataclass(frozen=True)
@@ -122,12 +158,14 @@ class Generation:
     version: int = PROJECTION_VERSION
 
 
-async def current_generation(connection: AsyncConnection, *, hold: Hold | None = None) -> Generation | None:
-    """Read the visible generation; None in a memory without tables.
+async def current_generation(
+    connection: AsyncConnection, *, hold: Hold | None = None, known: Generation | None = None
+) -> Generation | None:
+    """Read the visible generation, as `read_generation` does; None in a memory without tables.
 
     Raises `DatabaseForeign` if a newer version made its tables, `TablesOutdated` if an older one did.
     """
-    generation = await read_generation(connection, SHOWN, hold=hold)
+    generation = await read_generation(connection, SHOWN, hold=hold, known=known)
     if generation is not None and generation.version != PROJECTION_VERSION:
         versions = (
             f"the tables were made by version {generation.version} of the fold, this is version {PROJECTION_VERSION}"
@@ -138,15 +176,21 @@ async def current_generation(connection: AsyncConnection, *, hold: Hold | None =
     return generation
 
 
-async def read_generation(connection: AsyncConnection, name: str, *, hold: Hold | None = None) -> Generation | None:
-    """Read the generation under this key, of any version."""
+async def read_generation(
+    connection: AsyncConnection, name: str, *, hold: Hold | None = None, known: Generation | None = None
+) -> Generation | None:
+    """Read the generation under this key, of any version; return `known` if number, revision and version are its.
+
+    Layout and views, which have 0.1 MB, are then not read.
+    """
     if not await dialect_of(connection).has_table(connection, _NOTES, to_change=hold is not None):
         return None
-    query = select(_notes).where(_notes.c.projection == name)
-    if hold is not None:  # SQLite has no row locks and needs none: its write transaction excludes all others
-        query = query.with_for_update(read=hold != "change", skip_locked=hold == "if free")
-    row = (await connection.execute(query)).first()
-    return None if row is None else _generation(row)
+    number, revision, version = (known.number, known.revision, known.version) if known is not None else (-1, -1, -1)
+    values = {"name": name, "number": number, "revision": revision, "of_version": version}
+    row = (await connection.execute(_SELECTS[hold], values)).first()
+    if row is None or row.layout is None:
+        return None if row is None else known
+    return _generation(row)
 
 
 def select_generation(name: str) -> Select[tuple[int, int]]:

@@ -651,6 +651,7 @@ class LiveTarget:
 
     def __init__(self, log: EventLog) -> None:
         self.log = log
+        self._known: generations.Generation | None = None
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
         return await dialect_of(connection).rows(connection, EpisodeRow, SELECT_BEHIND, after=after, limit=limit)
@@ -663,9 +664,11 @@ class LiveTarget:
         return True
 
     async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
-        generation = await generations.current_generation(connection, hold=hold)
+        known = None if hold == "change" else self._known
+        generation = await generations.current_generation(connection, hold=hold, known=known)
         if generation is None:
             raise DatabaseUnavailable("the tables are missing: restore them from a backup, or run `pycrorm rebuild`")
+        self._known = generation
         return generation
 
     async def grow(
@@ -710,6 +713,7 @@ class SideTarget:
         self._number = number
         self._share = share
         self._place = ""
+        self._known: generations.Generation | None = None
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
         await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
@@ -733,7 +737,8 @@ class SideTarget:
         return True
 
     async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
-        generation = await generations.read_generation(connection, self._key, hold=hold)
+        known = None if hold == "change" else self._known
+        generation = await generations.read_generation(connection, self._key, hold=hold, known=known)
         if generation is None or self._number not in (None, generation.number):
             raise InternalError(
                 f"another process replaced the tables of {self._projection or 'the memory'} during the fold"
@@ -743,6 +748,7 @@ class SideTarget:
                 f"its tables have version {generation.version} now, but this process folds version {self._version}"
             )
         self._place = place_of(generation.number, self._projection)
+        self._known = generation
         return generation
 
     async def grow(

@@ -461,9 +461,9 @@ class EpisodeCases:
         """
         for event, happening in events:
             try:
-                if isinstance(happening, event_types.NodeStarted):
+                if type(happening) is event_types.NodeStarted:
                     self._start(event, happening, declaration_of)
-                elif isinstance(happening, event_types.NodeEnded):
+                elif type(happening) is event_types.NodeEnded:
                     action = self._running.pop(happening.node, None)
                     if action is not None:
                         cases.append(self._end(action, happening, event.monotonic_ns))

@@ -119,6 +119,10 @@ class Dialect(ABC):
 
     async def execute(self, connection: AsyncConnection, statement: Executable, **values: Any) -> CursorResult[Any]:
         """Execute a constant of `store.schema`; a list is passed as a JSON array."""
+        return await connection.exec_driver_sql(*self._bound(statement, values))
+
+    def _bound(self, statement: Executable, values: dict[str, Any]) -> tuple[str, tuple[Any, ...]]:
+        """Return the text and the parameters of a statement."""
         compiled = self._compiled.get(statement)
         if compiled is None:
             text = self.compile(statement)
@@ -127,15 +131,19 @@ class Dialect(ABC):
         sql, names, constants = compiled
         batches = {name: msgspec.json.encode(each).decode() for name, each in values.items() if isinstance(each, list)}
         parameters = constants | values | batches
-        return await connection.exec_driver_sql(sql, tuple([parameters[each] for each in names]))
+        return sql, tuple([parameters[each] for each in names])
+
+    async def fetch(self, connection: AsyncConnection, sql: str, parameters: tuple[Any, ...]) -> Sequence[Any]:
+        """Execute the text of a query in this database's own syntax, and fetch all rows."""
+        return (await connection.exec_driver_sql(sql, parameters)).all()
 
     async def rows(self, connection: AsyncConnection, kind: Any, statement: Executable, **values: Any) -> list[Any]:
         """Execute a query whose rows have the fields of this NamedTuple."""
-        return [make(kind, row) for row in await self.execute(connection, statement, **values)]
+        return [make(kind, row) for row in await self.fetch(connection, *self._bound(statement, values))]
 
     async def payloads(self, connection: AsyncConnection, statement: Executable, **values: Any) -> list[bytes]:
         """Execute a query of payloads."""
-        return [bytes(row[0]) for row in await self.execute(connection, statement, **values)]
+        return [bytes(row[0]) for row in await self.fetch(connection, *self._bound(statement, values))]
 
     def compile(self, element: Any) -> Compiled:
         """Compile a statement or the definition of a table of the log."""

@@ -298,6 +298,7 @@ SELECT_GROWN: Final = _in_order.where(
     sql.or_(EPISODE.c.number > bindparam("above"), EPISODE.c.ended_wall_ns.is_(None), _is_numbered)
 )
 SELECT_NUMBERS: Final = select(EPISODE.c.number).where(_is_numbered)
+SELECT_IDS: Final = select(EPISODE.c.number, _ValidId().label("id")).where(_is_numbered)
 SELECT_NUMBER_MAX: Final = select(func.coalesce(func.max(EPISODE.c.number), sql.literal_column("0")))
 
 _rows = _batch(

@@ -131,6 +131,10 @@ class SQLite(dialect.Dialect):
         exists = await self.has_table(connection, table.name)
         return dialect.TableState(exists, not exists, exists, exists)
 
+    async def fetch(self, connection: AsyncConnection, sql: str, parameters: tuple[Any, ...]) -> Sequence[Any]:
+        # A visit to the thread takes 0.03 ms, and 0.14 ms through SQLAlchemy.
+        return await (await _driver(connection)).visit(lambda driver: driver.execute(sql, parameters).fetchall())
+
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
         taken = (await self.execute(connection, schema.SELECT_NUMBER_MAX)).scalar_one()
         if await self.has_table(connection, schema.REMOVED.name):
@@ -162,9 +166,8 @@ class SQLite(dialect.Dialect):
     # --- tables and views made from the log ---------------------------------------------------------------------
 
     async def has_table(self, connection: AsyncConnection, name: str, *, to_change: bool = False) -> bool:  # noqa: ARG002
-        return (
-            await connection.exec_driver_sql("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,))
-        ).first() is not None
+        sql = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?"
+        return bool(await self.fetch(connection, sql, (name,)))
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[dialect.Expected]) -> None:
         # Counting the rows would hold the write lock all that time. Without statistics the planner assumes equal sizes:

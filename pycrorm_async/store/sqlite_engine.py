@@ -147,7 +147,11 @@ class Connection(aiosqlite.Connection):
             await super().commit()
 
     async def rollback(self) -> None:
-        if self._is_in_transaction():
+        if not self._is_in_transaction():
+            return
+        if self._is_idle:  # here, because a visit takes longer: nothing is written, and the thread uses nothing
+            self._conn.rollback()
+        else:
             await super().rollback()
 
     def _is_in_transaction(self) -> bool:
@@ -324,7 +328,7 @@ def _begin(connection: SyncConnection) -> None:
         assert isinstance(driver, Connection)
         driver.begin_to_read()
     elif statement is not None:
-        connection.exec_driver_sql(statement)
+        connection.connection.run_async(lambda driver: driver.cursor().execute(statement))
 
 
 def _set_pragmas(pragmas: Sequence[str], connection: Any, _record: Any) -> None:

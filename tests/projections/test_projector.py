@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -25,7 +26,7 @@ from pycrorm_async.events.types import (
     RefusalValue,
     RobotValue,
 )
-from pycrorm_async.projections.generations import PROJECTION_VERSION
+from pycrorm_async.projections.generations import PROJECTION_VERSION, SHOWN, read_generation
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import (
@@ -266,6 +267,44 @@ async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
     refusal = f"made by version {PROJECTION_VERSION + 1} of the fold, this is version {PROJECTION_VERSION}: use a newer"
     with pytest.raises(DatabaseForeign, match=refusal):
         await Projector(log).open()
+
+
+async def test_a_generation_is_read_again_only_where_number_revision_or_version_differ(log: EventLog) -> None:
+    await Projector(log).open()
+    async with log.engine.begin() as connection:
+        known = await read_generation(connection, SHOWN, hold="share")
+        assert known is not None
+        assert known.layout.leaves
+        assert await read_generation(connection, SHOWN, hold="share", known=known) is known
+        for other in (
+            replace(known, number=known.number + 1),
+            replace(known, revision=known.revision - 1),
+            replace(known, version=known.version - 1),
+        ):
+            again = await read_generation(connection, SHOWN, hold="share", known=other)
+            assert again == known
+        assert await read_generation(connection, "tables/making", known=known) is None
+
+
+async def test_a_projector_folds_into_the_columns_that_another_one_has_added_meanwhile(log: EventLog) -> None:
+    one, other = Projector(log), Projector(log)
+    await one.open()
+    await other.open()
+    for number, dtype in enumerate(("FirstAction", "SecondAction", "ThirdAction"), 1):
+        for projector, sign in ((one, 1), (other, 2)):
+            with_type = declared(
+                dtype, dtype.lower(), *(field(f"f{each}", "text", each + 1) for each in range(1, sign + 1))
+            )
+            script = Script(2 * number + sign)
+            script.put(EpisodeStarted("", "me", "host", "1.0", "3.11"))
+            parameters = {f"f{each}": f"{dtype} {sign}" for each in range(1, sign + 1)}
+            script.put(NodeStarted("action", None, name_of(with_type), parameters))
+            await log.append([*declarations(with_type), *script.records])
+            assert await projector.catch_up() == 2
+        assert await ask(log, f"SELECT f1, f2 FROM {dtype.lower()} ORDER BY id") == [
+            (f"{dtype} 1", None),
+            (f"{dtype} 2", f"{dtype} 2"),
+        ]
 
 
 @pytest.mark.parametrize("missing", [1, 2, 3])

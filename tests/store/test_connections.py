@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import aiosqlite
 import pytest
 from sqlalchemy import select, text
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -194,6 +195,31 @@ async def test_a_reading_transaction_begins_with_its_first_statement_and_sees_on
         cursor = await connection.cursor().execute("SELECT count(*) FROM node")
         assert await cursor.fetchone() == (5,)
         other.execute("DROP TABLE node")  # the last statement was in no transaction
+    await connection.close()
+
+
+async def test_a_rollback_takes_no_visit_to_the_thread_unless_that_is_busy(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    visits: list[Any] = []
+    visit = aiosqlite.Connection._execute
+
+    async def count(connection: Any, work: Any, *arguments: Any, **named: Any) -> Any:
+        visits.append(work)
+        return await visit(connection, work, *arguments, **named)  # type: ignore[no-untyped-call]
+
+    monkeypatch.setattr(aiosqlite.Connection, "_execute", count)
+    connection = await _connect(f"{file.as_uri()}?mode=rw", 1.0)
+    for is_busy in (False, True):
+        await connection.execute_in_turn([("BEGIN", ()), ("CREATE TABLE node (id)", ())])
+        visits.clear()
+        work = asyncio.create_task(connection.visit(lambda _: time.sleep(0.05))) if is_busy else None
+        await asyncio.sleep(0)
+        await connection.rollback()
+        assert len(visits) == 2 * is_busy  # the sleep, and the rollback behind it
+        if work is not None:
+            await work
+        assert not connection.in_transaction
     await connection.close()
 
 
