@@ -9,11 +9,9 @@ The memory that an import takes does not grow with the bag.
 
 from __future__ import annotations
 
-import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -30,6 +28,8 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _REPORTED = 5_000
 """The messages between two reports of the progress."""
 _TIMES_NS = range(2**63)
+_DAMAGE = struct.error, ValueError, EOFError, RuntimeError, OverflowError, MemoryError
+"""What reading a damaged file of MCAP raises, besides errors of its libraries."""
 _TF = "tf2_msgs/msg/TFMessage"
 
 
@@ -148,7 +148,7 @@ def _mcap_messages(path: Path, intake: Intake) -> Iterator[_Message]:
         while True:
             try:
                 record = next(records, None)
-            except (McapError, ZstdError, struct.error, ValueError, EOFError, RuntimeError) as error:
+            except (McapError, ZstdError, *_DAMAGE) as error:
                 reason = f"{type(error).__name__}{': ' if str(error) else ''}{error}"
                 intake.cut(path, f"cannot be read behind byte {file.tell():,}, after {count:,} messages ({reason})")
                 return
@@ -172,7 +172,7 @@ def _mcap_messages(path: Path, intake: Intake) -> Iterator[_Message]:
 
 
 def _sqlite_messages(path: Path, intake: Intake) -> Iterator[_Message]:
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+    with intakes.opened_database(path) as database:
         count = 0
         try:
             topics = {
@@ -186,7 +186,7 @@ def _sqlite_messages(path: Path, intake: Intake) -> Iterator[_Message]:
                 )
                 definitions.update(database.execute(known))
             [total] = database.execute("SELECT count(*) FROM messages").fetchone()
-        except sqlite3.DatabaseError as error:
+        except intakes.DATABASE_ERRORS as error:
             raise intakes.WrongFormat(f"{path} is no .db3 file of rosbag2: {error}") from None
         try:
             rows = database.execute("SELECT timestamp, topic_id, data FROM messages ORDER BY timestamp, id")
@@ -201,7 +201,7 @@ def _sqlite_messages(path: Path, intake: Intake) -> Iterator[_Message]:
                     continue
                 topic, name = topics[number]
                 yield _Message(at, topic, name, definitions.get(name, ""), _whole(data))
-        except sqlite3.DatabaseError as error:
+        except intakes.DATABASE_ERRORS as error:
             intake.cut(path, f"cannot be read after {count:,} messages: {error}")
 
 

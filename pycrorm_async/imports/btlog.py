@@ -14,10 +14,8 @@ transition 9 bytes: µs since the start (48 bits), the id of the node (uint16), 
 
 from __future__ import annotations
 
-import sqlite3
 import struct
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing
 from itertools import chain
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
@@ -103,10 +101,10 @@ def _read_file(path: Path, intake: Intake) -> None:
 def _read_sessions(path: Path, intake: Intake) -> None:
     identity = identity_of(path)
     select = "SELECT timestamp, node_uid, state FROM Transitions WHERE session_id = ? ORDER BY timestamp"
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+    with intakes.opened_database(path) as database:
         try:
             sessions = database.execute("SELECT session_id, xml_tree FROM Definitions ORDER BY session_id").fetchall()
-        except sqlite3.DatabaseError as error:
+        except intakes.DATABASE_ERRORS as error:
             raise intakes.WrongFormat(f"{path} is no log of BehaviorTree.CPP 4: {error}") from None
 
         def transitions(session: int) -> Iterator[tuple[int, int, int]]:
@@ -116,7 +114,7 @@ def _read_sessions(path: Path, intake: Intake) -> None:
                         yield row
                     else:
                         intake.left_out("transitions", "their time, node or status is no whole number")
-            except sqlite3.DatabaseError as error:
+            except intakes.DATABASE_ERRORS as error:
                 intake.cut(path, f"cannot be read to its end: {error}")
 
         for session, xml in sessions:

@@ -14,10 +14,13 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import sqlite3
 from collections import Counter, deque
-from collections.abc import Callable, Container, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias, cast, get_args
 
@@ -50,6 +53,11 @@ _END_STATUSES = frozenset(get_args(EpisodeStatus)) - {"RUNNING"}
 
 TIMES: Final = range(-(2**63), 2**63)
 """The times that can be recorded, in ns since 1970: from 1677 to 2262."""
+
+DATABASE_ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError)
+"""What reading a damaged file of SQLite raises; Python decodes the text of the error."""
+JSON_ERRORS: Final = (msgspec.DecodeError, UnicodeDecodeError)
+"""What decoding JSON with msgspec raises."""
 
 Numbers: TypeAlias = Sequence[float]
 Rate: TypeAlias = Annotated[float, msgspec.Meta(ge=1e-6)]
@@ -498,6 +506,14 @@ def ns_of(moment: datetime) -> int:
     if (at := (aware - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000) not in TIMES:
         raise CallerError(f"the time {moment} of the map file must be after 1677 and before 2262")
     return at
+
+
+@contextmanager
+def opened_database(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a file of SQLite to read it. Texts in another encoding than UTF-8 have `�` for what that does not have."""
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+        database.text_factory = partial(str, encoding="utf-8", errors="replace")
+        yield database
 
 
 def identity_of(path: Path, *further: Path) -> str:

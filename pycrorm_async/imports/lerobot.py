@@ -124,7 +124,7 @@ class _DataSet:
             self.info = msgspec.json.decode(content, type=_Info)
         except OSError:
             raise intakes.WrongFormat(f"{path} is no LeRobot data set: it has no meta/info.json") from None
-        except msgspec.DecodeError as error:
+        except intakes.JSON_ERRORS as error:
             raise intakes.WrongFormat(f"{file} is not that of a LeRobot data set: {error}") from None
         if not _FPS_MIN <= self.info.fps < _FPS_MAX or _TRAVERSAL.search(self.info.data_path):
             raise intakes.WrongFormat(f"{file} is not that of a LeRobot data set: its fps or its data_path cannot be")
@@ -169,7 +169,7 @@ class _DataSet:
             filters = [("episode_index", "=", row.number)]
             present = set(parquet.read_schema(row.file).names)
             table = parquet.read_table(row.file, columns=[each for each in wanted if each in present], filters=filters)
-        except (OSError, pa.ArrowException, KeyError) as error:
+        except (OSError, pa.ArrowException, KeyError, UnicodeDecodeError) as error:
             raise _Unreadable(str(error).splitlines()[0] if str(error) else type(error).__name__) from None
         return {name: _array(table.column(name)) for name in table.column_names}
 
@@ -183,7 +183,7 @@ class _DataSet:
                         yield msgspec.json.decode(line, type=dict[str, Any])
             except OSError:
                 raise intakes.WrongFormat(f"{self.path} has no meta/episodes.jsonl") from None
-            except msgspec.DecodeError as error:
+            except intakes.JSON_ERRORS as error:
                 raise intakes.WrongFormat(f"{file} has a line that is no JSON object: {error}") from None
             return
         files = sorted((meta / "episodes").rglob("*.parquet"))
@@ -213,7 +213,7 @@ class _DataSet:
             try:
                 content = lines.read_bytes().splitlines()
                 rows = [msgspec.json.decode(each, type=dict[str, Any]) for each in content if each]
-            except msgspec.DecodeError as error:
+            except intakes.JSON_ERRORS as error:
                 raise intakes.WrongFormat(f"{lines} has a line that is no JSON object: {error}") from None
         names = {}
         for each in rows:
@@ -231,7 +231,7 @@ class _DataSet:
             present = [each for each in columns if each in opened.schema_arrow.names] if columns is not None else None
             for batch in opened.iter_batches(_BATCH, columns=present):
                 yield from batch.to_pylist()
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
             raise intakes.WrongFormat(f"{file} cannot be read: {str(error).splitlines()[0]}") from None
 
 

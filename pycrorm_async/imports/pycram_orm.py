@@ -21,12 +21,10 @@ from __future__ import annotations
 import re
 import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import quote
 from zoneinfo import ZoneInfo
 
 from pycrorm_async.errors import CallerError
@@ -73,7 +71,7 @@ def read_pycram_orm(path: Path, settings: OrmMap, intake: Intake) -> None:
     if path.is_dir():
         raise intakes.WrongFormat(f"{path} is a folder: name the file of the database")
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as database:
+        with intakes.opened_database(path) as database:
             database.row_factory = sqlite3.Row
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if not tables >= _NEEDED:
@@ -83,7 +81,7 @@ def read_pycram_orm(path: Path, settings: OrmMap, intake: Intake) -> None:
                 _Episode(database, tables, dict(row), zone, intake).give(path)
     except KeyError as error:
         raise intakes.WrongFormat(f"{path} is no database of PyCRAM's ORM: it has no column {error}") from None
-    except sqlite3.Error as error:
+    except intakes.DATABASE_ERRORS as error:
         raise intakes.WrongFormat(f"{path} cannot be read as a database of SQLite: {error}") from None
 
 
