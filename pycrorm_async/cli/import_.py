@@ -25,6 +25,8 @@ from pycrorm_async.settings import Settings
 
 _SHOWN = 50
 """Bounds the episodes of the table, as for `pycrorm episodes`; `--json` prints all."""
+_SETTINGS = Settings(fold="at_end", flush_timeout_s=300)
+"""No robot waits for an import, and on a busy machine one batch of a large one may fold for longer than 15 s."""
 _COUNTS = ("nodes", "objects", "changes", "samples", "observations")
 
 
@@ -73,7 +75,7 @@ def _record(
     file_format: str, paths: list[Path], map_file: Path | None, place: Place, report_progress: ProgressCallback | None
 ) -> ImportReport:
     place.shared_address  # noqa: B018  refuses sqlite://, which would end with this process
-    with Memory.sync(place.url, spool=place.spool, settings=Settings(fold="at_end")) as memory:
+    with Memory.sync(place.url, spool=place.spool, settings=_SETTINGS) as memory:
         report = import_files(file_format, paths, memory.recording, map_file=map_file, report_progress=report_progress)
         memory.flush()
         status = memory.status

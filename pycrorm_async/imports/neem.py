@@ -17,7 +17,7 @@ episode are one of their own. IRIs are kept as they are, in columns.
 
 Transforms whose clock differs from that of the actions by whole hours, as after a conversion to local time, and jumps
 back by whole hours, are corrected; the metadata has the number of seconds. A second import of the same NEEM records
-nothing.
+nothing. Triples of a NEEM are in memory, 280 MB for 100,000 actions of 11; transforms are not.
 """
 
 from __future__ import annotations
@@ -142,15 +142,20 @@ class Facts:
     def of(cls, files: NeemFiles, left_out: Callable[..., object], cuts: list[FileCut]) -> Facts:
         """Read the triples and the description of a NEEM."""
         facts = cls()
+        texts: dict[str, str] = {}  # so that each text is in memory once
+        relations: dict[str, tuple[str, bool]] = {}
         for triple in _uncut(chain.from_iterable(triples(file, left_out) for file in files.of("triples")), cuts):
             if triple.graph is not None:
                 left_out("triples", "they belong to an ontology, which every NEEM copies")
                 continue
-            name, is_inverse = vocabulary.relation(triple.p)
-            if is_inverse and isinstance(triple.o, str):
-                facts._objects[triple.o][name].append(triple.s)
-            else:
-                facts._objects[triple.s][name].append(triple.o)
+            if (relation := relations.get(triple.p)) is None:
+                relation = relations[triple.p] = vocabulary.relation(triple.p)
+            name, is_inverse = relation
+            s, o = texts.setdefault(triple.s, triple.s), triple.o
+            if isinstance(o, str):
+                o = texts.setdefault(o, o)
+                s, o = (o, s) if is_inverse else (s, o)
+            facts._objects[s][name].append(o)
         metas = [each for file in files.of("meta") for each in _uncut(documents(file), cuts)]
         facts.meta = next((each for each in metas if str(each.get("_id")) == files.name), metas[0] if metas else {})
         facts._find_actions()
@@ -385,10 +390,12 @@ class _Episode:
             above = facts.parents.get(action)
             if begin is not None and above in intervals and intervals[above][0] is None:
                 intervals[above] = begin, intervals[above][1]
-        spans = []
+        spans, late, late_own = [], self._parameters, self._own_parameters
         for action, (begin, end) in intervals.items():
             if (own := facts.own(action)) is not None:
-                spans.append(self._own_span(action, own))
+                span = self._own_span(action, own)
+                span.late = late_own
+                spans.append(span)
                 continue
             above = facts.parents.get(action)
             around = intervals.get(above or "", (None, None))[0]
@@ -396,12 +403,10 @@ class _Episode:
             if start < _RELATIVE:
                 start, end = start + base, end + base if end is not None else None
             status, failure = self._outcome(action)
-            task = facts.iri(action, "executesTask")
-            task_class = facts.class_of(task if task is not None else action)
-            class_name = vocabulary.local(task_class)
+            class_name = vocabulary.local(facts.class_of(facts.iri(action, "executesTask") or action))
             dtype = self._settings.types.get(class_name) or vocabulary.DTYPES.get(class_name, class_name)
             span = NodeSpan(action, dtype, {}, _ns(start), None if end is None else _ns(max(end, start)))
-            span.late = partial(self._parameters, action, task, task_class, dtype)
+            span.late = late
             span.parent = above if above in self._members else None
             span.status, span.failure = status, failure
             nil = len([each for each in facts.all(action, "hasParticipant") if str(each) in ("NIL", "nil")])
@@ -421,11 +426,14 @@ class _Episode:
         failure = own.get("failure")
         span.failure = (str(failure[0]), str(failure[1])) if failure else None
         span.result = own.get("result")
-        span.late = lambda episode: {
+        return span
+
+    def _own_parameters(self, span: NodeSpan, episode: IntakeEpisode) -> tuple[dict[str, Any], None]:
+        own = self._facts.own(str(span.key)) or {"parameters": {}}
+        return {
             name: self._object(each["$object"], episode) if isinstance(each, dict) and "$object" in each else each
             for name, each in own["parameters"].items()
-        }
-        return span
+        }, None
 
     def _outcome(self, action: str) -> tuple[NodeStatus, tuple[str, str] | None]:
         facts = self._facts
@@ -439,12 +447,11 @@ class _Episode:
             return ("FAILED" if failure is not None and status == "UNKNOWN" else status), failure
         return ("FAILED" if failure is not None else "UNKNOWN"), failure
 
-    def _parameters(
-        self, action: str, task: str | None, task_class: str, dtype: str, episode: IntakeEpisode
-    ) -> dict[str, Any]:
+    def _parameters(self, span: NodeSpan, episode: IntakeEpisode) -> tuple[dict[str, Any], None]:
         """Return the parameters of an action, as the objects are known when it starts."""
-        facts, participants = self._facts, self._facts.participants(action)
-        values: dict[str, Any] = {"iri": action, "task": task, "task_class": task_class}
+        facts, action, dtype = self._facts, str(span.key), span.dtype
+        participants, task = facts.participants(action), facts.iri(action, "executesTask")
+        values: dict[str, Any] = {"iri": action, "task": task, "task_class": facts.class_of(task or action)}
         if participants:
             values["participants"] = participants
             if dtype in _WITH_OBJECT:
@@ -464,7 +471,7 @@ class _Episode:
             text = facts.iri(action, name)
             if text is not None:
                 values[name] = text
-        return values
+        return values, None
 
     def _region(self, region: str) -> Any:
         """Return the value of a parameter: a pose if the region has one, else its class."""

@@ -24,8 +24,8 @@ class NodeSpan:
     Attributes:
         key: names it in its episode.
         start, end: in ns since 1970; without an end it ends with its episode, or after the last of the other nodes.
-        robot: the state of the robot when the node started.
-        late: returns further parameters when the node starts, and takes the episode.
+        late: returns further parameters and the state of the robot when the node starts, so that nodes that wait for it
+            take little memory.
         parent: the key of the node it is inside; the root takes the place of one that is not in the file.
         failure: reason and message.
         instants: observations of it: time, name, values.
@@ -42,8 +42,7 @@ class NodeSpan:
     failure: tuple[str, str] | None = None
     result: Any = None
     instants: Sequence[tuple[int, str, object]] = ()
-    late: Callable[[IntakeEpisode], Mapping[str, Any]] | None = None
-    robot: RobotValue | None = None
+    late: Callable[[NodeSpan, IntakeEpisode], tuple[Mapping[str, Any], RobotValue | None]] | None = None
 
 
 def nest(spans: Iterable[NodeSpan]) -> None:
@@ -68,32 +67,31 @@ def give_spans(episode: IntakeEpisode, spans: Sequence[NodeSpan], others: Iterab
     places = _places(spans)
     steps: list[tuple[int, int, int, int, Any]] = []
     last = max((each.start if each.end is None else each.end for each in spans), default=0)
-    for index, span in enumerate(spans):
+    for span in spans:
         begin, depth = places[span.key]
-        steps.append((begin, START, depth, index, span))
-        steps += [(max(each[0], begin), INSTANT, depth, index, (span, each)) for each in span.instants]
+        steps.append((begin, START, depth, len(steps), span))  # the number keeps the order of the file
+        for each in span.instants:
+            steps.append((max(each[0], begin), INSTANT, depth, len(steps), (span, each)))
         end = last if span.end is None and span.status != "UNKNOWN" else span.end
         if end is not None:
-            steps.append((max(end, begin), END if end > begin else EMPTY_END, -depth, index, span))
-    further = ((each[0], OTHER, 0, index, each) for index, each in enumerate(others))
-    for _at, phase, _depth, _index, what in heapq.merge(sorted(steps, key=_order), further, key=_order):
+            steps.append((max(end, begin), END if end > begin else EMPTY_END, -depth, len(steps), span))
+    happenings = ((each[0], OTHER, 0, index, each) for index, each in enumerate(others))
+    steps.sort()
+    for _at, phase, _depth, _number, what in heapq.merge(steps, happenings):
         if phase == OTHER:
             at, give = what
             give(at)
         elif phase == START:
             parent = what.parent if what.parent in places else None
-            parameters = what.parameters if what.late is None else {**what.parameters, **what.late(episode)}
-            episode.start(what.key, what.kind, what.dtype, parameters, what.start, parent=parent, robot=what.robot)
+            further, robot = what.late(what, episode) if what.late is not None else ({}, None)
+            parameters = {**what.parameters, **further}
+            episode.start(what.key, what.kind, what.dtype, parameters, what.start, parent=parent, robot=robot)
         elif phase == INSTANT:
             span, (at, name, values) = what
             episode.observe(name, values, at, node=span.key)
         else:
             is_timed, at = what.end is not None, last if what.end is None else what.end
             episode.end(what.key, what.status, at, failure=what.failure, result=what.result, untimed=not is_timed)
-
-
-def _order(step: tuple[int, int, int, int, Any]) -> tuple[int, int, int, int]:
-    return step[:4]
 
 
 def _places(spans: Sequence[NodeSpan]) -> dict[Hashable, tuple[int, int]]:
