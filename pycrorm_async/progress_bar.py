@@ -14,7 +14,16 @@ from pycrorm_async.visible_text import visible
 
 
 class VisibleConsole(Console):
-    """A console that makes the control characters of each text it gets visible; the styles are its own."""
+    """A console that makes the control characters of each text it gets visible; the styles are its own.
+
+    Only a terminal gets styles, bars and pictures that are drawn in place. rich also takes for one what FORCE_COLOR names
+    so, as notebooks and services that build software do for every pipe.
+    """
+
+    @property
+    def is_terminal(self) -> bool:
+        """Whether a person sees the output at once."""
+        return bool(self.file.isatty())
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Return a text, also that of a cell, as rich prints it."""

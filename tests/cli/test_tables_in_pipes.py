@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -174,3 +177,15 @@ def test_the_package_lists_its_public_names() -> None:
     import pycrorm_async
 
     assert set(pycrorm_async.__all__) <= set(dir(pycrorm_async))
+
+
+def test_a_pipe_gets_no_colour_and_no_bar_where_notebooks_and_services_set_force_color(tmp_path: Path) -> None:
+    with Memory.sync(f"sqlite:///{tmp_path / 'pycrorm.db'}") as memory:
+        memory.recording.episode(description="\x1b red").close()
+    words = [sys.executable, "-m", "pycrorm_async"]
+    for verb in (["episodes", "--csv"], ["copy", "--from", "sqlite:///pycrorm.db", "--to", "sqlite:///b.db"]):
+        done = subprocess.run(
+            [*words, *verb], cwd=tmp_path, env=os.environ | {"FORCE_COLOR": "1"}, capture_output=True, check=True
+        )
+        assert done.stdout.count(b"\x1b") == verb.count("--csv")  # the text of the episode
+        assert done.stderr == b""
