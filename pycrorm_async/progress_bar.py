@@ -16,8 +16,8 @@ from pycrorm_async.visible_text import visible
 class VisibleConsole(Console):
     """A console that makes the control characters of each text it gets visible; the styles are its own.
 
-    Only a terminal gets styles, bars and pictures that are drawn in place. rich also takes for one what FORCE_COLOR names
-    so, as notebooks and services that build software do for every pipe.
+    Only a terminal gets styles, bars and pictures that are drawn in place. rich also takes a pipe for a terminal where
+    FORCE_COLOR is set, as it is in notebooks and in services that build software.
     """
 
     @property

@@ -21,6 +21,7 @@ from pycrorm_async.orm import NavigateAction, ProcessMetaData
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.pose import NoWorld, WorldClosed
+from tests.commands import answer, one_line_of, pycrorm
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 pytestmark = pytest.mark.slow
@@ -101,20 +102,28 @@ def test_a_connected_world_serves_every_context_until_it_is_closed() -> None:
 #
 # The notebooks run in a kernel: cells record into what an earlier cell connected, and draw what they end with.
 
-NOTEBOOKS = (HERE / "connected.ipynb", HERE.parent / "tutorial.ipynb")
+EXAMPLES = sorted(HERE.parents[1].glob("pycrorm_async/examples/*.ipynb"))
+OTHERS = [each for each in EXAMPLES if each.stem in ("a_fleet", "why_did_it_fail", "your_ros_bag")]
+QUICK = [HERE / "connected.ipynb", *(each for each in EXAMPLES if each not in OTHERS)]
 
 
-async def test_the_notebooks_run_and_record_and_the_tutorial_draws_what_it_shows(tmp_path: Path) -> None:
-    command = [sys.executable, str(HERE / "execute_notebook.py"), str(tmp_path), *map(str, NOTEBOOKS)]
+async def executed(folder: Path, notebooks: list[Path]) -> dict[str, list[dict[str, Any]]]:
+    """Return what the cells of the notebooks end with in a kernel, by the notebook's name."""
+    command = [sys.executable, str(HERE / "execute_notebook.py"), str(folder), *map(str, notebooks)]
     environment = os.environ | {"PYTHONPATH": str(HERE.parent.parent)}
     ran = await asyncio.to_thread(
         lambda: subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=200, check=False
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=400, check=False
         )
     )
     assert ran.returncode == 0, ran.stderr
+    return {each.stem: outputs(folder / each.name) for each in notebooks}
 
-    (positions,) = outputs(tmp_path / "connected.ipynb")
+
+async def test_notebooks_record_draw_and_learn(tmp_path: Path) -> None:
+    cells = await executed(tmp_path, QUICK)
+
+    (positions,) = cells["connected"]
     assert positions["text/plain"] == "[1.0, 2.0, 3.0]"
     async with Reading.open(url_of(tmp_path)) as reading, reading.session() as session:
         actions = (await session.scalars(select(NavigateAction).order_by(NavigateAction.id))).all()
@@ -125,8 +134,7 @@ async def test_the_notebooks_run_and_record_and_the_tutorial_draws_what_it_shows
             ("two ways in one cell", "SUCCEEDED"),
         ]
 
-    drawn = outputs(tmp_path / "tutorial.ipynb")
-    memory, tree, chart, failures, actions_, moment, picture, page, tally, places, arms, learned, closed = drawn[1:]
+    memory, tree, chart, failures, actions_, moment, picture, page, closed = cells["first_episode"][1:]
     assert "Bring the milk" in memory["text/html"]
     assert "FAILED" in tree["text/html"]
     assert "IKError: " in tree["text/html"]
@@ -134,14 +142,55 @@ async def test_the_notebooks_run_and_record_and_the_tutorial_draws_what_it_shows
     assert "MoveTCPMotion" in failures["text/html"]
     assert actions_["text/plain"].startswith("[('RIGHT', 'FAILED', 1.3, -0.5)")
     assert "l_gripper_tool_frame" in moment["text/html"]
-    for each in (picture, places, arms):
-        assert each["image/png"].startswith("iVBORw0KGgo")  # PNG in base64
     assert page["text/plain"].startswith("Report(path=PosixPath('milk.html'), first=1,")
     assert page["text/html"].startswith('<iframe sandbox="allow-scripts"')
-    assert "of 300 succeeded" in tally["text/plain"]
-    before, after = (int(each) for each in learned["text/plain"].replace("%", "").replace("'", "").split()[::2])
-    assert before < 25 < after
     assert "not open" in closed["text/html"]
+
+    tally, _frame, places, causes, learned, recalled = cells["learn_from_a_thousand"]
+    assert "170 of 1000 succeeded" in tally["text/plain"]
+    assert "IKError" in causes["text/html"]
+    before, after = (int(each) for each in learned["text/plain"].replace("%", "").replace("'", "").split()[::2])
+    assert before < 25 < 60 < after
+    assert "RecalledPickUpAction" in recalled["text/html"]
+    for each in (picture, places):
+        assert each["image/png"].startswith("iVBORw0KGgo")  # PNG in base64
+
+
+@pytest.mark.soak
+async def test_the_other_examples_have_the_answers_that_they_announce(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    cells = await executed(tmp_path, OTHERS)
+
+    ended, copied, _episodes, causes, transports, _steps, *_ = cells["a_fleet"]
+    assert (ended["text/plain"], copied["text/plain"]) == ("[0, 0, 0]", "0")
+    assert "ObjectUnfetchable" in causes["text/html"]
+    rows = [line.split()[1:] for line in transports["text/plain"].splitlines()[1:]]
+    assert rows == [
+        ["anna", "SUCCEEDED", "2"],
+        ["ben", "SUCCEEDED", "2"],
+        ["cleo", "FAILED", "1"],
+        ["cleo", "SUCCEEDED", "1"],
+        ["dora", "FAILED", "1"],
+        ["dora", "SUCCEEDED", "1"],
+    ]
+
+    _world, _memory, failures, tree, refused, *_, recalled, differences = cells["why_did_it_fail"]
+    assert "no object is named tea" in failures["text/html"]
+    assert "ObjectUnfetchable" in tree["text/html"]
+    assert "too far: from shoulder to wrist" in refused["text/plain"]
+    assert recalled["text/plain"].startswith("<Answer: 2 of 2 cases for TransportAction; 1 of 2 succeeded")
+    assert "cereal" in differences["text/html"]
+
+    tree, chart, moment, failures, streams, samples = cells["your_ros_bag"]
+    assert tree["text/plain"].splitlines()[1:] == [
+        "  NavigateToPose SUCCEEDED 7.00 s",
+        "  NavigateToPose FAILED 6.00 s the action server aborted the goal: the action server aborted the goal",
+        "  NavigateToPose SUCCEEDED 3.00 s",
+    ]
+    assert "turtle Pose(position=[-3.67" in moment["text/plain"]
+    assert "joint_states         2      200" in streams["text/plain"]
+    assert samples["text/plain"].count("\n") > 5
+    assert all(each["text/html"].strip() for each in (chart, failures))
 
 
 def outputs(notebook: Path) -> list[dict[str, Any]]:
@@ -153,7 +202,19 @@ def outputs(notebook: Path) -> list[dict[str, Any]]:
     return [{kind: "".join(text) for kind, text in each.items()} for each in results]
 
 
-def test_the_tutorial_is_stored_without_outputs() -> None:
-    for path in NOTEBOOKS:
+def test_the_notebooks_are_stored_without_outputs() -> None:
+    for path in (*QUICK, *OTHERS):
         cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
         assert [(cell["outputs"], cell["execution_count"]) for cell in cells] == [([], None)] * len(cells)
+
+
+def test_the_command_copies_the_examples_and_overwrites_none(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert answer("examples", "mine", cwd=tmp_path).keys() == {f"mine/{each.name}" for each in EXAMPLES}
+    copies = {each: (tmp_path / "mine" / each.name) for each in EXAMPLES}
+    assert all(copy.read_text() == each.read_text() for each, copy in copies.items())
+    changed = copies[EXAMPLES[0]]
+    changed.write_text("mine")
+    refused = pycrorm("examples", "mine", cwd=tmp_path)
+    assert (refused.returncode, changed.read_text()) == (2, "mine")
+    assert f"mine/{changed.name} would be overwritten: name another folder" in one_line_of(refused)

@@ -441,4 +441,5 @@ def test_the_page_of_the_command_names_every_verb_and_no_other(tmp_path: Path) -
     for verb in sorted(verbs):
         done = CliRunner().invoke(app(verb), [verb, "--help"])  # as the command does
         assert done.exit_code == 0
-        assert {"spool": "repair", "copy": "--from", "ask": "root_failures"}.get(verb, "--url") in done.stdout
+        expected = {"spool": "repair", "copy": "--from", "ask": "root_failures", "examples": "FOLDER"}
+        assert expected.get(verb, "--url") in done.stdout
