@@ -830,6 +830,7 @@ class Ask(Generic[Q]):
                 sa.cast(sa.func.sum(count.c.number), sa.Integer).label("samples"),
                 sa.func.max(observation.c.time).label("time"),
             )
+            .select_from(observation)  # the condition of a join may have a subquery, so that it does not show the left side
             .join(block, joined(observation.c.id, block, observation) & (block.c.media_type == SAMPLES))
             .join(count, joined(observation.c.id, count, observation) & (count.c.key == "samples"))
             .join(channels, joined(observation.c.id, channels, observation) & (channels.c.key == "channels"))
