@@ -331,6 +331,62 @@ def _failures(episode: Any) -> sa.CTE:
     return statement.cte("failed").prefix_with("MATERIALIZED", dialect="postgresql")
 
 
+def _history(name: str, episode: Any) -> Rows:
+    """Select the events of the object of this name, in their order."""
+    attached, removed, joints = orm.Attachment.__table__, orm.ObjectRemoval.__table__, orm.JointChange.__table__
+    seen, other = orm.Detection.__table__, _OBJECT.alias("other")
+    is_added = _OBJECT.c.id == _OBJECT.c.identity_id
+    begins = orm.Attachment.kind == "attached"
+    named = sa.select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(
+        frames.is_named(_OBJECT.c.name, name), frames.of_episode(_OBJECT.c.process_metadata_id, episode)
+    )
+    joined = partial(_joined, episode)
+
+    def is_one(table: Any, id_: Any) -> sa.ColumnElement[bool]:
+        return sa.tuple_(id_, table.c.process_metadata_id).in_(named)
+
+    failed = _failures(episode)
+    # IN chooses the rows, and what is joined to them is joined outside: of inner joins that share the episode
+    # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
+    courses = [
+        _course(_OBJECT, Object.sequence, sa.case((is_added, "added"), else_="moved"), place=_POSE)
+        .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
+        .where(frames.is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
+        *(
+            _course(attached, orm.Attachment.sequence, happening, other=other.c.name, detail=attached.c.link)
+            .outerjoin(other, joined(partner, other, attached))
+            .where(is_one(attached, own))
+            for happening, own, partner in (
+                (attached.c.kind, attached.c.child_id, attached.c.parent_id),
+                (sa.case((begins, "holds"), else_="releases"), attached.c.parent_id, attached.c.child_id),
+            )
+        ),
+        _course(removed, orm.ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
+        _course(joints, orm.JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position).where(
+            is_one(joints, joints.c.object_id)
+        ),
+        _course(
+            seen, orm.Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen
+        ).where(frames.is_named(seen.c.name, name)),
+        _course(
+            failed,
+            failed.c.sequence,
+            "an action failed",
+            detail=failed.c.reason,
+            node_id=failed.c.id,
+            time=failed.c.start_time,
+        ).where(frames.is_named(failed.c.object, name)),
+    ]
+    courses = [each.where(frames.of_episode(each.selected_columns.episode, episode)) for each in courses]
+    course = sa.union_all(*courses).subquery("course")
+    of_course = _NODE.c.id == course.c.node_id, _NODE.c.process_metadata_id == course.c.episode
+    return (
+        sa.select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
+        .outerjoin(_NODE, sa.and_(*of_course, frames.of_episode(_NODE.c.process_metadata_id, episode)))
+        .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
+    )
+
+
 # === ask ======================================================================================================
 
 
@@ -706,61 +762,7 @@ class Ask(Generic[Q]):
     @staticmethod
     def object_history(name: Name, *, episode: Of = None, limit: Limit = None) -> Rows:
         """List all that happened to the object of this name: added, moved, attached, seen, failed with, removed."""
-        attached, removed, joints = orm.Attachment.__table__, orm.ObjectRemoval.__table__, orm.JointChange.__table__
-        seen, other = orm.Detection.__table__, _OBJECT.alias("other")
-        is_added = _OBJECT.c.id == _OBJECT.c.identity_id
-        begins = orm.Attachment.kind == "attached"
-        named = sa.select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(
-            frames.is_named(_OBJECT.c.name, name), frames.of_episode(_OBJECT.c.process_metadata_id, episode)
-        )
-        joined = partial(_joined, episode)
-
-        def is_one(table: Any, id_: Any) -> sa.ColumnElement[bool]:
-            return sa.tuple_(id_, table.c.process_metadata_id).in_(named)
-
-        failed = _failures(episode)
-        # IN chooses the rows, and what is joined to them is joined outside: of inner joins that share the episode
-        # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
-        courses = [
-            _course(_OBJECT, Object.sequence, sa.case((is_added, "added"), else_="moved"), place=_POSE)
-            .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
-            .where(
-                frames.is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"
-            ),
-            *(
-                _course(attached, orm.Attachment.sequence, happening, other=other.c.name, detail=attached.c.link)
-                .outerjoin(other, joined(partner, other, attached))
-                .where(is_one(attached, own))
-                for happening, own, partner in (
-                    (attached.c.kind, attached.c.child_id, attached.c.parent_id),
-                    (sa.case((begins, "holds"), else_="releases"), attached.c.parent_id, attached.c.child_id),
-                )
-            ),
-            _course(removed, orm.ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
-            _course(
-                joints, orm.JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position
-            ).where(is_one(joints, joints.c.object_id)),
-            _course(
-                seen, orm.Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen
-            ).where(frames.is_named(seen.c.name, name)),
-            _course(
-                failed,
-                failed.c.sequence,
-                "an action failed",
-                detail=failed.c.reason,
-                node_id=failed.c.id,
-                time=failed.c.start_time,
-            ).where(frames.is_named(failed.c.object, name)),
-        ]
-        courses = [each.where(frames.of_episode(each.selected_columns.episode, episode)) for each in courses]
-        course = sa.union_all(*courses).subquery("course")
-        of_course = _NODE.c.id == course.c.node_id, _NODE.c.process_metadata_id == course.c.episode
-        statement = (
-            sa.select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
-            .outerjoin(_NODE, sa.and_(*of_course, frames.of_episode(_NODE.c.process_metadata_id, episode)))
-            .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
-        )
-        return frames.limited(statement, limit)
+        return frames.limited(_history(name, episode), limit)
 
     @_Question
     @staticmethod
@@ -830,7 +832,9 @@ class Ask(Generic[Q]):
                 sa.cast(sa.func.sum(count.c.number), sa.Integer).label("samples"),
                 sa.func.max(observation.c.time).label("time"),
             )
-            .select_from(observation)  # the condition of a join may have a subquery, so that it does not show the left side
+            .select_from(
+                observation
+            )  # the condition of a join may have a subquery, so that it does not show the left side
             .join(block, joined(observation.c.id, block, observation) & (block.c.media_type == SAMPLES))
             .join(count, joined(observation.c.id, count, observation) & (count.c.key == "samples"))
             .join(channels, joined(observation.c.id, channels, observation) & (channels.c.key == "channels"))
