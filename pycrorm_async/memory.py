@@ -232,7 +232,7 @@ class Memory:
         writer: Writer | None = None,
         settings: Settings | None = None,
     ) -> Memory:
-        """Open a memory for all contexts of this process that have none of their own, until `close`; as `open` does.
+        """Open a memory for all contexts of this process that have none of their own, until `close`; see `open`.
 
         It is meant for notebooks, where each cell has a context of its own: actions of the following cells are
         recorded, each in an episode of its own or in that of its cell, also in threads that the user starts. If several
@@ -744,7 +744,7 @@ class SyncMemory:
         return self._memory.recent_episodes
 
     def flush(self, timeout_s: float | None = None) -> None:
-        """Wait until all events recorded so far are visible in the tables; raises as `Memory.flush` does.
+        """Wait until all events recorded so far are visible in the tables. Raises the errors of `Memory.flush`.
 
         Raises `FlushTimeout` also after `timeout_s`, if it is given. The events are safe in the spool.
         """

@@ -120,7 +120,7 @@ class Parts:
         return self._made_experience
 
     async def flush(self) -> None:
-        """Wait until all events recorded so far are stored and visible. Raises as `Memory.flush` does."""
+        """Wait until all events recorded so far are stored and visible. Raises the errors of `Memory.flush`."""
         position = self.queue.written
         await self.queue.synced_to(position)
         await self.writer.flush(position)

@@ -120,13 +120,13 @@ class Decoder:
             raise msgspec.DecodeError(str(error)) from None
 
     def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
-        """Decode a designator type of the version that its payload names, or 1. Raises as `decode` does."""
+        """Decode a designator type of the version that its payload names, or 1. Raises what `decode` raises."""
         event = self._declaration("DesignatorTypeDeclared", payload)
         assert isinstance(event, DesignatorTypeDeclared)
         return event
 
     def description_of(self, payload: bytes) -> DescriptionDeclared:
-        """Decode a description of the version that its payload names, or 1. Raises as `decode` does."""
+        """Decode a description of the version that its payload names, or 1. Raises what `decode` raises."""
         event = self._declaration("DescriptionDeclared", payload)
         assert isinstance(event, DescriptionDeclared)
         return event

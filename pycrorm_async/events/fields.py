@@ -327,7 +327,7 @@ def changed_tags(tags: Iterable[str], added: Iterable[str], removed: Iterable[st
 
 
 def retagged(tags: Iterable[str], added: Iterable[str], removed: Collection[str]) -> tuple[str, ...]:
-    """Return the tags after a recorded change, as `changed_tags` does; ignore a removed tag that is not there.
+    """Return the tags after a recorded change. A removed tag that the episode does not have is ignored.
 
     >>> retagged(("kitchen", "good"), ("night",), ("good", "late"))
     ('kitchen', 'night')

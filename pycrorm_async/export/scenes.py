@@ -147,7 +147,7 @@ E = TypeVar("E", bound=ExportedEpisode)
 async def read_episode(
     reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
 ) -> ExportedEpisode:
-    """Read an episode, as `read_episode_as` does."""
+    """Read an episode as an `ExportedEpisode`."""
     return await read_episode_as(ExportedEpisode, reading, covered, report_events)
 
 

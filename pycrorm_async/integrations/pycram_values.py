@@ -308,7 +308,7 @@ def _function_name(function: Any) -> str:
 
 
 def _with_grasp(values: dict[str, Any]) -> dict[str, Any]:
-    """Put the side of a grasp description under `grasp`, as `PickUpAction` has it, and the rest under its own names."""
+    """Put the side of a grasp description under `grasp`, and the rest under its own names."""
     if "grasp_description" not in values:
         return values
     grasp = values.pop("grasp_description")

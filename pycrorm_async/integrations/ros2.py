@@ -34,7 +34,7 @@ class RosRecording:
 
     Args:
         node: an `rclpy` node.
-        message_class: returns the class of a message by its name, as `rosidl_runtime_py.utilities.get_message` does.
+        message_class: returns the class of a message by name, such as `rosidl_runtime_py.utilities.get_message`.
         quality: returns the quality of service of a subscription for those of a topic's publishers.
         now_ns: the time of a message's receipt, in ns since 1970.
 

@@ -218,7 +218,7 @@ def _describe_exit(code: int | None) -> str:
 async def _run_daemon(place: MemoryLocation) -> AsyncIterator[asyncio.Task[None]]:
     """Drain the workers' recorders until the context ends, except while another daemon drains the spool.
 
-    Yields the task of the daemon, which ends early only with an error. Raises as `serve` does.
+    Yields the task of the daemon, which ends early only with an error. Raises the errors of `serve`.
     """
     stop, ready = asyncio.Event(), asyncio.Event()
     task = asyncio.create_task(_drain(place, stop, ready), name="pycrorm daemon")
@@ -237,7 +237,7 @@ async def _run_daemon(place: MemoryLocation) -> AsyncIterator[asyncio.Task[None]
 async def _drain(place: MemoryLocation, stop: asyncio.Event, ready: asyncio.Event) -> None:
     """Drain until `stop` is set; set `ready` when this or another daemon drains.
 
-    Raises as `serve` does, except that it retries after `SpoolTaken` and, once ready, after `DatabaseUnavailable`.
+    Raises the errors of `serve`, but retries after `SpoolTaken` and, once ready, after `DatabaseUnavailable`.
     """
 
     def log(line: str) -> None:

@@ -235,7 +235,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return self._condition(Evidence(self._strong_enough(), height=_around(self.height)), "at this height")
 
     def grounded(self) -> Policy:
-        """Condition the policy as `policy_here` does, and on the free places that see the object.
+        """Condition the policy on height and mass of the object, and on the free places that see it.
 
         Raises `ObjectUnreachable` if that has probability 0.
         """

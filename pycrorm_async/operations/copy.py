@@ -81,7 +81,7 @@ async def copy_episodes(
 
     Creates a missing target. Calls `report_progress` with the number of events done and their total. Damage to one
     episode does not prevent copying the others. Raises `UnknownEpisode`, `CallerError` if both are the same memory, and
-    as `Memory.open` does; events copied until then stay.
+    the errors of `Memory.open`; events copied until then stay.
     """
     source_address, target_address = shared_address(source), shared_address(target)
     log = await EventLog.open(source_address, create=False)

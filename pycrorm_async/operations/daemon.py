@@ -64,7 +64,7 @@ async def serve(
     the first may be `forked` already; while none is ready, this process folds.
 
     Raises `SpoolTaken` when another daemon drains this spool, `DatabaseForeign` when the SQLite file is replaced while
-    it is open, and as `Memory.open` does.
+    it is open, and the errors of `Memory.open`.
     """
     address = shared_address(url)
     settings = settings or Settings()

@@ -83,7 +83,7 @@ class LogAndTables:
         self._comparing = asyncio.Lock()
 
     async def open_tables(self) -> None:
-        """Open the tables. Raises as `Projector.open` does, except `TablesForeign`: each fold then opens them again."""
+        """Open the tables. Raises the errors of `Projector.open` but `TablesForeign`: each fold opens them again."""
         try:
             await self._projector.open()
         except errors.TablesForeign as error:

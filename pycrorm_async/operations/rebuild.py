@@ -123,7 +123,7 @@ async def rebuild_projection(
     report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> RebuildSummary:
-    """Rebuild the tables of one custom projection, as `rebuild_memory` does. Raises also `DatabaseForeign`."""
+    """Rebuild the tables of one custom projection. Raises the errors of `rebuild_memory`, and `DatabaseForeign`."""
     return await _run(url, lambda log: Rebuild.begin(log, projection=projection), 1, report_progress, clock)
 
 

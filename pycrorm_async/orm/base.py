@@ -121,7 +121,7 @@ class EnumName(TypeDecorator[Any]):
 
 
 class _Members(dict[str | None, Any]):
-    """The members of an enum by name, and the names it lacks as `EnumName.member` returns them; NULL is None."""
+    """The members of an enum by name. A name that it lacks is an arm of `Arms` or stays a text; NULL is None."""
 
     def __init__(self, enum: type[Enum]) -> None:
         super().__init__(**enum.__members__)
@@ -376,7 +376,7 @@ class AttributeOnRequest(InstrumentedAttribute[Any]):
 class HybridOf(hybrid_property[_Value]):
     """A private attribute under its public name, which a subclass may map a field of its own under.
 
-    If it is loaded `on_request` only, reading it raises `CallerError` as `AttributeOnRequest` does.
+    If it is loaded `on_request` only, reading it before it is loaded raises `CallerError`.
     """
 
     def __init__(self, name: str, *, on_request: bool = False) -> None:

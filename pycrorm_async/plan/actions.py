@@ -392,7 +392,7 @@ class OpenActionPerformable(CheckedAction):
 
 @dataclass
 class CloseActionPerformable(CheckedAction):
-    """Close a drawer or a door by its handle; the open hand stays at the handle. Raises as `OpenAction` does."""
+    """Close a drawer or a door by its handle; the open hand stays at the handle. Raises what `OpenAction` raises."""
 
     concept: ClassVar[str | None] = "Closing"
 

@@ -133,7 +133,7 @@ def hold_pose(handle: Handle) -> poses.Pose:
 
 
 def hand_poses(handle: Handle, goal: float, start: float | None = None) -> list[poses.Pose]:
-    """Return poses as `handle_poses` does, but of the tool frame of a hand that holds the handle."""
+    """Return the poses of the tool frame of a hand that holds the handle while its joint moves (`handle_poses`)."""
     grip = hold_pose(handle)
     return [each @ grip for each in handle_poses(handle, goal, start)]
 

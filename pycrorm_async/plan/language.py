@@ -165,7 +165,7 @@ class ActionDescription(Composable, Generic[P]):
         return next(iter(self))
 
     def __iter__(self) -> Iterator[P]:
-        """Yield every combination, the last property varying fastest. Raises as `resolve` does."""
+        """Yield every combination, the last property varying fastest. Raises what `resolve` raises."""
         choices = [self._choices(name, among) for name, among in self._alternatives.items()]
         too_weak: list[dict[str, Any]] = []
         for combination in itertools.product(*choices):

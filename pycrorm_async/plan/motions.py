@@ -306,7 +306,7 @@ class OpeningMotion(BaseMotion):
 
 @dataclass
 class ClosingMotion(BaseMotion):
-    """Close a drawer or a door with the hand on its handle; the hand follows. Raises as `OpeningMotion` does."""
+    """Close a drawer or a door with the hand on its handle; the hand follows. Raises what `OpeningMotion` raises."""
 
     concept: ClassVar[str | None] = "Closing"
 
@@ -325,7 +325,7 @@ class ClosingMotion(BaseMotion):
 class AccessingMotion(BaseMotion):
     """Move a joint by a distance with the hand on its handle; a positive distance opens, a negative one closes.
 
-    Raises as `OpeningMotion` does, and `EnvironmentManipulationImpossible` for a distance beyond the joint's limits.
+    Raises what `OpeningMotion` raises; also `EnvironmentManipulationImpossible` for a distance beyond its limits.
 
     Attributes:
         part_of: the furniture.

@@ -263,7 +263,7 @@ def _as_tuple(name: str, kind: type[T], values: T | Iterable[T] | None) -> tuple
 
 
 class LocatedObjectDescription(ObjectDesignatorDescription):
-    """Describes objects as `ObjectDesignatorDescription` does, and locates each relative to reference objects.
+    """Describes objects by names and types, and locates each relative to reference objects.
 
     Args:
         references: alternatives for the reference.

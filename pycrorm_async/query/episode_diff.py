@@ -70,8 +70,8 @@ class EpisodeDiff(NotebookValue):
     def sql(self) -> str:
         """The SQL of the rows that are compared: facts, nodes and last places of the objects of each episode.
 
-        It reads the rows as `diff_episodes` does. The comparison is made in Python, because nodes correspond by paths
-        and numbers among siblings, and parameters are compared entry by entry.
+        `diff_episodes` reads these rows. It compares them in Python, because nodes correspond by paths and numbers
+        among siblings, and parameters are compared entry by entry.
         """
         parts = {"facts": _facts, "nodes": nodes_of, "last places of objects": _last_places}
         return "\n\n".join(

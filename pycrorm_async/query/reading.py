@@ -100,7 +100,7 @@ class Reading:
     @classmethod
     @asynccontextmanager
     async def open_address(cls, address: DatabaseAddress) -> AsyncIterator[Self]:
-        """Open the existing memory at a located address. Raises as `open` does."""
+        """Open the existing memory at a located address. Raises `DatabaseUnavailable` and `DatabaseForeign`."""
         reading = cls(address)
         try:
             await reading.refresh()

@@ -463,7 +463,7 @@ class ReadOnlySql:
         self._log = log
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
-        """Return the rows of one query. Raises as `stream` does."""
+        """Return the rows of one query. Raises what `stream` raises."""
         async with self.stream(sql, limits) as rows:
             collected = [row async for row in rows]
             return SqlResult(rows.columns, collected, rows.more)

@@ -151,7 +151,7 @@ class Appender(core.Tail):
         at: tuple[int, int] | None = None,
         after: int = 0,
     ) -> int:
-        """Append one event of any kind as `RecorderQueue.put_nowait` does, which tries `append` first."""
+        """Append one event of any kind, for `RecorderQueue.put_nowait`, which tries `append` first."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
         body = spool_format.encode_body(name, payload)

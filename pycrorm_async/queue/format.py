@@ -134,7 +134,7 @@ def read_segment(path: Path) -> bytes:
 
 
 def map_segment(path: Path) -> mmap.mmap:
-    """Map a segment read-only, shared with the process that writes it. Raises as `read_segment` does."""
+    """Map a segment read-only, shared with the process that writes it. Raises what `read_segment` raises."""
     descriptor, size = _open_segment(path)
     try:
         if size == 0:
@@ -511,7 +511,7 @@ class Reader:
         return ReadBatch(records, total, ReadCursor(number, offset, position), complete)
 
     def skip_to(self, position: int) -> None:
-        """Move the cursor behind this position; the records up to it must be readable. Raises as `read` does."""
+        """Move the cursor behind this position; the records up to it must be readable. Raises what `read` raises."""
         while self.cursor.position < position:
             self.cursor = self.read(last=position, events_max=10_000, bytes_max=2**22).after
 

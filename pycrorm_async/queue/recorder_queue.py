@@ -174,7 +174,7 @@ class RecorderQueue:
         Any thread may call it. On return the blob survives `kill -9`, and it is synced and stored before any event put
         afterwards. It is kept as long as the events put until `release_blob`, which the caller calls once for each put.
 
-        Raises `SpoolFull` without waiting if it does not fit, `SpoolClosed` as `put_nowait` does, and
+        Raises `SpoolFull` without waiting if it does not fit, `SpoolClosed` after `close` and in a forked child, and
         `SpoolUnavailable` if the disk refuses it.
         """
         with spools.wrap_os_errors(self.folder):
@@ -211,8 +211,9 @@ class RecorderQueue:
     def block_until_room(self, timeout_s: float, *, reserved: bool = True) -> bool:
         """Block this thread until an event fits or the queue refuses all events; False after `timeout_s`.
 
-        Warns, and raises `SpoolStuck`, as `room` does. Returns False at once in the sync thread, which frees the space:
-        a finalizer that runs there may end a plan, and with it record an event.
+        Warns after two seconds. Raises `SpoolStuck` when waiting cannot help, because draining has stopped (`fail`).
+        Returns False at once in the sync thread, which frees the space: a finalizer that runs there may end a plan, and
+        with it record an event.
         """
         if self._sync_thread.is_this_thread:
             return False

@@ -90,7 +90,10 @@ def survey(
     *,
     on_frame: Callable[[spool_format.ReadCursor, spool_format.Frame], None] | None = None,
 ) -> Survey:
-    """Scan as `scan` does, and return damage. Calls `on_frame` with each kept frame and the cursor behind it."""
+    """Scan a folder, and return damage instead of raising it.
+
+    Calls `on_frame` with each kept frame and the cursor behind it.
+    """
     scanner = SegmentScanner(folder, recorder, on_frame=on_frame)
     damage: SpoolDamaged | None = None
     try:
@@ -135,7 +138,7 @@ class SegmentScanner:
     def step(self) -> bool:
         """Scan one more segment; False when the scan has finished and no synced record is missing.
 
-        Raises as `scan` does.
+        Raises what `scan` raises.
         """
         if self.damage is not None:
             raise self.damage

@@ -359,7 +359,7 @@ class Runs(EpisodeBlock):
         failure: FailureCause | None = None,
         result: Any = None,
     ) -> None:
-        """Record that a run ended, as `RecordedEpisode.end` does, if it is open."""
+        """Record that a run ended, if it is open; see `RecordedEpisode.end`."""
         if self.episode.is_open(run_id):
             self.episode.end(run_id, status, failure, result)
 

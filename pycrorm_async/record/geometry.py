@@ -122,7 +122,7 @@ class Descriptions:
             return None
 
     def declare_text(self, urdf: str) -> str | None:
-        """Declare a description that no world has loaded, as `declare` does."""
+        """Declare a description that no world has loaded, and return its fingerprint; None if it fails."""
         return self.declare(_ReadDescription(urdf))
 
     def urdf_of(self, name: str, urdf: Any) -> str | None:

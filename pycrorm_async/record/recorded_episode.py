@@ -413,7 +413,7 @@ class RecordedEpisode:
     def observe(
         self, name: str, values: object, *, node: Hashable | None = None, at: At | None = None
     ) -> Callable[[], object]:
-        """Record an observation, as `Memory.observe` does."""
+        """Record an observation; `Memory.observe` describes name and values."""
         copied = self._values.converted(values)
         return self._timed("Observed", at, lambda: self._writer.observe(name, copied, node))
 

@@ -697,7 +697,7 @@ class FailureCopies:
     def copy(
         self, failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
     ) -> event_types.FailureValue:
-        """Copy as `failure_value` does. Raises no `Exception`."""
+        """Copy class, message and arguments of an exception. Raises no `Exception`."""
         if not issubclass(type(failure), BaseException):  # whatever an executive gave, which may deny its class
             return failure_value(failure, references, convert)
         arguments, message = _ARGS(failure), message_of(failure)
@@ -715,7 +715,7 @@ class FailureCopies:
 def failure_value(
     failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
 ) -> event_types.FailureValue:
-    """Copy class, message and arguments, each as `convert` returns it, of an exception. Raises no `Exception`."""
+    """Copy class, message and converted arguments of an exception. Raises no `Exception`."""
     return event_types.FailureValue(
         type=cut(_path_of(type(failure)), _FAILURE_NAME_MAX),
         message=cut(clean(message_of(failure)), _MESSAGE_MAX),

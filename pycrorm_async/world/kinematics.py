@@ -109,7 +109,7 @@ def solve_from(
     limits: Limits = Limits.SOFT,
     narrower: Callable[[str], tuple[float, float]] | None = None,
 ) -> dict[str, float]:
-    """Solve as `solve` does, for a root link at `base` and the torso at `torso_height` m; needs no world.
+    """Return the joint angles of `solve` for a root link at `base` and a torso at `torso_height` m, without a world.
 
     The torso height is not checked against its limits. The rolls of forearm and wrist are in [-π, π]. `narrower`
     returns the limits of a joint in a loaded model, which narrow the described ones.

@@ -79,7 +79,7 @@ def _in_metres(vertices: NDArray[np.float64], content: bytes) -> NDArray[np.floa
 def mesh_points(path: str) -> NDArray[np.float64]:
     """Return the vertices of a mesh file, each once; read again only when the file has changed.
 
-    Raises `ValueError` as `read_mesh` does.
+    Raises `ValueError` with the path for a file that `read_mesh` refuses.
     """
     try:
         return _points(path, file_status(path))
@@ -103,7 +103,7 @@ def _points(path: str, _status: FileStatus) -> NDArray[np.float64]:
 
 
 def is_read_by_bullet(path: str, *, collision: bool) -> bool:
-    """Return whether Bullet reads a mesh file as `read_mesh` does: OBJ, binary STL and, to draw it only, DAE.
+    """Return whether Bullet reads the triangles of a mesh file right: of OBJ, of binary STL and, to draw them, DAE.
 
     A damaged OBJ or DAE would end the process inside Bullet.
     """
