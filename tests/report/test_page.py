@@ -598,6 +598,9 @@ def test_a_narrow_page_has_room_for_the_slider_the_help_and_whole_names(
         assert tab.ask("document.querySelector('#controls input').clientWidth") > 250
         assert tab.ask("document.querySelector('.help').getBoundingClientRect().width") > 20
         assert tab.ask("document.querySelector('.clock').scrollWidth <= document.querySelector('.clock').clientWidth")
+        tab.press("?")
+        explained = tab.ask("document.querySelector('#help p:last-child').textContent")
+        assert all(f"{word} is" in explained for word in ("an episode", "A node", "An event", "A snapshot"))
     with chrome.open(pages["plan"], width=800) as tab:
         cut = "[...document.querySelectorAll('.row .name')].filter((each) => each.scrollWidth > each.clientWidth)"
         names = tab.ask(f"{cut}.map((each) => each.textContent)")

@@ -16,6 +16,7 @@ const HELP = [
   "Space plays, in proportion to time if the axis of the chart is time. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
   "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows all of the moment and its paths, R follows the robot.",
   "Chart: the wheel zooms, a double click shows all.",
+  "Words: an episode is one recorded run of a plan. A node is one performed step of it, such as an action or a motion. An event is one fact that was stored when it happened, e12 the twelfth of the episode. A snapshot is the state of nodes, objects and robots at one moment.",
 ];
 const part = (name) => document.getElementById(name);
 
@@ -111,7 +112,7 @@ class Page {
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     this.clock = element("output", { class: "clock" });
     this.axis = element("button", { type: "button", class: "axis", title: "axis of the chart: events, which are equally far apart, or time (A)", onclick: () => this.#changeAxis() }, "by event");
-    const help = element("button", { type: "button", class: "help", title: "keys and mouse (?)", "aria-label": "keys and mouse", onclick: () => this.#help() }, "?");
+    const help = element("button", { type: "button", class: "help", title: "keys, mouse and words (?)", "aria-label": "keys, mouse and words", onclick: () => this.#help() }, "?");
     part("controls").append(this.play, this.slider, this.clock, this.axis, help);
     const whole = element("button", { type: "button", title: "show all that is there at this moment, and its paths (W)", onclick: () => this.#showWhole() }, "whole scene");
     this.tracking = element("button", { type: "button", title: "keep the robot, or the chosen object, in sight (R)", onclick: () => this.#track() });
