@@ -1,16 +1,20 @@
-"""Compare two episodes: facts, task trees, last places of objects.
+"""Compare episodes: facts, task trees, last places of objects of two; of more, the nodes at which they part.
 
 Panel: Ask, 3.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.cli.output import Form, counted, note, print_json, print_line, print_table, stdout
 from pycrorm_async.cli.reading import Place
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.episode_diff import Parting, partings
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.text import duration
 
@@ -22,13 +26,32 @@ def diff(
     second: Annotated[str, typer.Argument(metavar="B", help=_HELP)],
     place: Place,
     form: Form,
+    others: Annotated[
+        list[str] | None, typer.Argument(metavar="[C]...", help="More episodes: list the nodes at which all part.")
+    ] = None,
     sql: Annotated[bool, typer.Option("--sql", help="Print the SQL of the rows that are compared.")] = False,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Write two as a page: aligned trees, two scenes.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file of --html if it exists.")] = False,
 ) -> None:
     """Compare two episodes: their circumstances, their task trees, and the last places of their objects.
 
     Nodes correspond by the types from the root down. A node that only one episode has is listed without its children.
+    Of more than two episodes, such as ten runs of one plan, it lists the nodes that ended in several ways.
     SQL reads the rows (`--sql`); the comparison is made in Python.
     """
+    if others:
+        if sql or html is not None:
+            raise CallerError(f"{'--sql' if sql else '--html'} compares two episodes: name two")
+        _print_partings(place.read(lambda reading: partings(reading, [first, second, *others])), form)
+        return
+    if html is not None:
+        from pycrorm_async.report.comparison import write_comparison  # here, because it loads numpy and recall
+
+        file = place.read(lambda reading: write_comparison(reading, first, second, html, force=force))
+        print_json({"file": file, "bytes": file.stat().st_size}) if form.as_json else print_line(file)
+        return
     compared = place.read(lambda reading: reading.diff(first, second))
     if sql:
         print_line(compared.sql)
@@ -51,6 +74,16 @@ def diff(
     if rows or not form.is_table:
         print_table("Differences", ("of", "where", "what", "A", "B"), rows, as_csv=form.as_csv)
     note(f"{counted(len(rows), 'difference')}; nodes that are the same: {compared.same_nodes:,}")
+
+
+def _print_partings(parted: Sequence[Parting], form: Form) -> None:
+    if form.as_json:
+        print_json(parted)
+        return
+    rows = [(each.where, f"{each.otherwise} of {each.runs}", each.text) for each in parted]
+    if rows or not form.is_table:
+        print_table("Where the episodes part", ("where", "otherwise", "ended"), rows, as_csv=form.as_csv)
+    note(f"{counted(len(rows), 'node')} that ended in several ways")
 
 
 def _line(episode: EpisodeSummary) -> str:

@@ -98,6 +98,68 @@ async def diff_episodes(reading: EpisodeReader, first: AskedEpisode, second: Ask
     return EpisodeDiff(one, other, differences, same)
 
 
+@dataclass(frozen=True)
+class Parting:
+    """A node that ended in several ways in some runs of a plan.
+
+    Attributes:
+        where: the node's path.
+        runs: number of the runs in which the node around it was.
+        outcomes: the episodes by the status and reason of the node, or `not started`, the most frequent outcome first.
+    """
+
+    where: str
+    runs: int
+    outcomes: Mapping[str, tuple[int, ...]]
+
+    @property
+    def otherwise(self) -> int:
+        """The number of runs in which it did not end as in most."""
+        return self.runs - len(next(iter(self.outcomes.values())))
+
+    @property
+    def text(self) -> str:
+        """The outcomes with their numbers, and the episodes of all but the most frequent one."""
+        usual, *others = self.outcomes
+        named = [f"{len(self.outcomes[each])} {each}: {', '.join(map(str, self.outcomes[each]))}" for each in others]
+        return "; ".join([f"{len(self.outcomes[usual])} {usual}", *named])
+
+
+async def partings(reading: EpisodeReader, episodes: Sequence[AskedEpisode]) -> list[Parting]:
+    """Return the nodes at which runs of one plan part, in the order of the tree; nodes correspond as in a diff.
+
+    A node that misses in a run with all around it is not listed for that run. Raises `UnknownEpisode`.
+    """
+    runs = [await reading.episode(episode_name(each)) for each in episodes]
+    by_number = {each.number: _by_path(await reading.tree(each)) for each in runs}
+    listed = []
+    for path in _united(by_number.values()):
+        outcomes: dict[str, list[int]] = {}
+        for number, nodes in by_number.items():
+            if len(path) == 1 or path[:-1] in nodes:
+                node = nodes.get(path)
+                reason = f" ({node.reason})" if node is not None and node.reason else ""
+                outcomes.setdefault(f"{node.status}{reason}" if node is not None else "not started", []).append(number)
+        if len(outcomes) > 1:
+            sorted_outcomes = sorted(outcomes.items(), key=lambda each: -len(each[1]))
+            numbers = {outcome: tuple(each) for outcome, each in sorted_outcomes}
+            listed.append(Parting(_path_text(path), sum(map(len, numbers.values())), numbers))
+    return listed
+
+
+def _united(trees: Iterable[Mapping[_Path, NodeSummary]]) -> list[_Path]:
+    """Return the paths of all trees; one that earlier trees lack comes behind that before it in its own tree."""
+    places: dict[_Path, tuple[int, ...]] = {}
+    for number, nodes in enumerate(trees):
+        before: tuple[int, ...] = ()
+        for index, path in enumerate(nodes):
+            if path in places:
+                before = places[path]
+            else:
+                places[path] = (*before, number, index)
+    return sorted(places, key=places.__getitem__)
+
+
 # --- facts ----------------------------------------------------------------------------------------------------
 
 _FACTS = (
