@@ -87,7 +87,7 @@ class Comparison {
       const seconds = row.nodes.map((each) => this.#secondsOf(each));
       const [least, most] = [Math.min(...seconds), Math.max(...seconds)];
       if (most >= LONGER * least && most - least > LONGER_SHARE * this.longest) {
-        const times = least > 0 ? `${(most / least).toFixed(1)} × as long` : "longer";
+        const times = least > 0 ? `${(most / least).toFixed(1)} times as long` : "longer";
         row.marks.push(["longer", `${LETTERS[seconds.indexOf(most)]} took ${times}`]);
       }
     }
