@@ -69,8 +69,8 @@ def test_the_page_of_two_episodes_marks_what_differs_in_aligned_trees(
     assert diff(url, 1, 2, "--html", page) == (0, f"{page}\n")
     with chrome.open(page) as tab:
         assert tab.ask(MARKS) == [
-            "root: ", "TakeAction: ended otherwise", "Look: only in B", "Reach: other parameters,A took 2.0 times as long",
-            "Grip: ended otherwise", "Lift: only in A",
+            "root: ", "TakeAction: ended otherwise", "Look: only in B",
+            "Reach: other parameters,A took 2.0 times as long", "Grip: ended otherwise", "Lift: only in A",
         ]  # fmt: skip
         assert f"slipped {HOSTILE}" not in tab.ask("document.getElementById('nodes').innerHTML")
         facts = tab.ask("document.getElementById('differences').textContent")
