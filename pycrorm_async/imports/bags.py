@@ -34,7 +34,10 @@ _TF = "tf2_msgs/msg/TFMessage"
 
 
 class _Message(NamedTuple):
-    """A message: when it was received, its topic and type, the definition of that, and its bytes in CDR."""
+    """A message: when it was received, its topic and type, the definition of that, and its bytes in CDR.
+
+    The type is empty if it is no message of ROS 2, which are those in CDR.
+    """
 
     at: int
     topic: str
@@ -64,7 +67,7 @@ def read_bag(path: Path, settings: RosMap, intake: Intake) -> None:
                 break
             if message.at not in _TIMES_NS:
                 intake.left_out("messages", "their times are out of range")
-            elif not reader.wants(topic, type_name):
+            elif not type_name or not reader.wants(topic, type_name):
                 unwanted[topic, type_name] += 1
             elif reader.is_due(topic, type_name, message.at):
                 try:
@@ -76,7 +79,10 @@ def read_bag(path: Path, settings: RosMap, intake: Intake) -> None:
                     undecoded[topic, type_name] += 1
         reader.finish()
         for (topic, type_name), count in unwanted.items():
-            intake.left_out(f"messages of {topic}", f"{type_name} is recorded if `observations` names its topic", count)
+            why = (
+                f"{type_name} is recorded if `observations` names its topic" if type_name else "they are none of ROS 2"
+            )
+            intake.left_out(f"messages of {topic}", why, count)
         for (topic, type_name), count in undecoded.items():
             intake.left_out(f"messages of {topic}", f"they cannot be decoded as {type_name}", count)
 
@@ -164,7 +170,7 @@ def _mcap_messages(path: Path, intake: Intake) -> Iterator[_Message]:
                     intake.left_out("messages", "the file has no channel of their number")
                 case Channel(id=number, topic=topic, schema_id=schema_id, message_encoding=encoding):
                     schema = schemas.get(schema_id)
-                    name = schema.name if schema is not None and encoding == "cdr" else f"{encoding} messages"
+                    name = schema.name if schema is not None and encoding == "cdr" else ""
                     is_text = schema is not None and schema.encoding == "ros2msg"
                     topics[number] = topic, name, schema.data.decode(errors="replace") if schema and is_text else ""
                 case Schema(id=number):

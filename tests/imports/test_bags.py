@@ -271,6 +271,18 @@ def test_definitions_of_the_file_decode_goals_and_unknown_types_are_counted(tmp_
     }
 
 
+def test_messages_in_another_encoding_are_counted_whatever_their_topic_is(tmp_path: Path) -> None:
+    with (tmp_path / "foxglove.mcap").open("wb") as written:
+        writer = mcap.writer.Writer(written)
+        writer.start()
+        schema = writer.register_schema("tf2_msgs/msg/TFMessage", "jsonschema", b"{}")
+        channel = writer.register_channel("/tf", "json", schema)
+        writer.add_message(channel, AT, b"{}", AT)
+        writer.finish()
+    report = imported(tmp_path, "mcap", tmp_path / "foxglove.mcap")
+    assert report.left_out == {("messages of /tf", "they are none of ROS 2"): 1}
+
+
 def test_frames_in_a_circle_and_times_that_go_back_end_no_import(tmp_path: Path) -> None:
     rows = [
         tf_row(0, ("a", "b", (1.0, 0.0, 0.0), 0.0), ("b", "a", (1.0, 0.0, 0.0), 0.0)),
