@@ -6,13 +6,15 @@ tf are transforms again. Observations, joints, percepts and attachments have no 
 
 What the vocabulary has no relation for (the type of a node, its exact status and times, its parameters) stands in
 triples of our own (`neem_vocabulary.OWN`), which KnowRob keeps and ignores, so that an import gives the same
-nodes, statuses, times and poses.
+nodes, statuses, times and poses. Those of nodes are long, and stand with the annotations: KnowRob has an index over the
+objects of triples, and none over the values of annotations.
 
 | file, each in a folder `roslog` | documents |
 |---|---|
 | `triples.bson` | s, p, o, the classes above (`p*`, `o*`), graph, scope |
 | `tf.bson` | one for each transform |
-| `annotations.bson`, `inferred.bson` | none |
+| `annotations.bson` | s, p, v: labels, and what our memory knows about nodes |
+| `inferred.bson` | none |
 | `meta.bson` | the description of the NEEM, as the hub has it |
 """
 
@@ -45,13 +47,15 @@ from pycrorm_async.writer.drain import run_to_completion
 _DATABASE: Final = "roslog"
 """The name of KnowRob's database, which is that of the folder in each collection's folder."""
 _INDEXES: Final = {
-    "triples": ("s p o p* o* s,p s,o o,p s,p* s,o* o,p* p,o* s,o,p s,p,o* s,o*,p").split(),
+    "triples": ("s p o p* o* s,p s,o o,p s,p* s,o* o,p* p,o* s,o,p s,o,p* s,o*,p").split(),
     "tf": "header.stamp header.stamp,child_frame_id".split(),
     "annotations": "s p s,p".split(),
     "inferred": [],
     "meta": [],
 }
 """The indexes of KnowRob's collections, without that of `_id`."""
+_ANNOTATIONS: Final = (f"{RDFS}label", f"{OWN}node")
+"""The relations whose values stand in the collection of annotations: of KnowRob's own, the one that is written."""
 _FOREVER: Final = {"time": {"since": 0.0, "until": float("inf")}}
 _CHANNELS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -236,11 +240,11 @@ async def write_neem(job: Job, folder: Path) -> Written:
     episode = await read_episode_as(NeemEpisode, job.reading, covered, job.reporter("reading"))
     moves = [*episode.moves, *[each async for each in _streamed(episode, job.reading)]]
     moves.sort(key=lambda each: each.at)
-    facts = [_document(*each) for each in triples_of(episode)]
+    facts = [*triples_of(episode)]
     collections: dict[str, Iterable[Mapping[str, Any]]] = {
-        "triples": facts,
+        "triples": (_document(*each) for each in facts if each[1] not in _ANNOTATIONS),
         "tf": (_transform(number, each) for number, each in enumerate(moves)),
-        "annotations": (),
+        "annotations": ({"s": s, "p": p, "v": v} for s, p, v in facts if p in _ANNOTATIONS),
         "inferred": (),
         "meta": [_meta(episode)],
     }

@@ -82,10 +82,8 @@ def read_neem(path: Path, settings: NeemMap, intake: Intake) -> None:
     cuts: list[FileCut] = []
     for files in neems_in(path):
         facts = Facts.of(files, intake.left_out, cuts)
-        for kind in ("annotations", "inferred"):
-            count = sum(1 for file in files.files.get(kind, ()) for _ in _uncut(documents(file), cuts))
-            if count:
-                intake.left_out(kind, "they are text of an ontology, or a cache of answers", count)
+        for _ in _uncut(chain.from_iterable(map(documents, files.of("inferred"))), cuts):
+            intake.left_out("inferred", "they are a cache of answers")
         for findings, count in facts.findings().items():
             intake.left_out("checks", findings, count)
         for index, episode in enumerate(facts.episodes()):
@@ -156,6 +154,11 @@ class Facts:
                 o = texts.setdefault(o, o)
                 s, o = (o, s) if is_inverse else (s, o)
             facts._objects[s][name].append(o)
+        for triple in _uncut(chain.from_iterable(triples(file, left_out) for file in files.of("annotations")), cuts):
+            if triple.p.startswith(vocabulary.OWN):
+                facts._objects[triple.s][vocabulary.local(triple.p)].append(triple.o)
+            else:
+                left_out("annotations", "they are text of an ontology, or labels of individuals")
         metas = [each for file in files.of("meta") for each in _uncut(documents(file), cuts)]
         facts.meta = next((each for each in metas if str(each.get("_id")) == files.name), metas[0] if metas else {})
         facts._find_actions()

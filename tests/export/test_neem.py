@@ -114,8 +114,25 @@ def test_the_folder_is_that_of_knowrob(tmp_path: Path) -> None:
     assert (begin, end) == (1_556_700_002.123457, 1_556_700_003.123456)
     [above] = [each["o*"] for each in facts if each["o"] == f"{SOMA}PickingUp"]
     assert above[:3] == [f"{SOMA}PickingUp", f"{SOMA}Manipulating", f"{SOMA}PhysicalTask"]
-    metadata = json.loads((neem / "triples/roslog/triples.metadata.json").read_text())
-    assert len(metadata["indexes"]) == 16
+    notes: list[dict[str, Any]] = bson.decode_all((neem / "annotations/roslog/annotations.bson").read_bytes())
+    assert {frozenset(each) for each in notes} == {frozenset(("_id", "s", "p", "v"))}
+    assert {each["p"] for each in notes} == {f"{neems.RDFS}label", "urn:pycrorm:neem#node"}
+    assert not {each["p"] for each in facts} & {each["p"] for each in notes}
+    indexes = {
+        kind: [
+            [*each["key"]] for each in json.loads((neem / f"{kind}/roslog/{kind}.metadata.json").read_text())["indexes"]
+        ]
+        for kind in ("triples", "annotations", "tf", "inferred")
+    }
+    assert indexes == {
+        "triples": [
+            ["_id"], ["s"], ["p"], ["o"], ["p*"], ["o*"], ["s", "p"], ["s", "o"], ["o", "p"], ["s", "p*"], ["s", "o*"],
+            ["o", "p*"], ["p", "o*"], ["s", "o", "p"], ["s", "o", "p*"], ["s", "o*", "p"],
+        ],
+        "annotations": [["_id"], ["s"], ["p"], ["s", "p"]],
+        "tf": [["_id"], ["header.stamp"], ["header.stamp", "child_frame_id"]],
+        "inferred": [["_id"]],
+    }  # fmt: skip
     [first, *_] = bson.decode_all((neem / "tf/roslog/tf.bson").read_bytes())
     assert (first["header"]["frame_id"], first["child_frame_id"], first["transform"]["translation"]["x"]) == (
         "map", "pr2", 0.1,
