@@ -112,7 +112,8 @@ def test_groups_have_their_success_and_two_of_them_are_compared(chrome: Browser,
         tab.ask("document.querySelector('#reasons button').click()")
         assert tab.ask(ROWS) in (["4"], ["6"])
         tab.ask("pycrormOverview.settings.set({ cause: '', vs: ['a', 'b'], of: '' })")
-        tab.ask(f"new pycrormOverview.constructor({{ title: '', total: 150, episodes: {NEWCOMBE} }})")
+        tab.ask(f"pycrormOverview.extend({{ episodes: {NEWCOMBE} }})")
+        tab.wait_for("pycrormOverview.chosen.length === 150")
         assert tab.ask(GROUPS)[1][0].endswith("+20 (+5 to +33)")
 
 

@@ -28,8 +28,16 @@ export function replaceIn(holder, ...children) {
   const focused = holder.contains(document.activeElement) && holder !== document.activeElement ? keyOf(document.activeElement) : null;
   holder.replaceChildren(...children);
   if (focused === null) return;
-  const same = [...holder.querySelectorAll("button, a")].find((each) => keyOf(each) === focused);
+  const same = [...holder.querySelectorAll("button, a, [data-key]")].find((each) => keyOf(each) === focused);
   (same ?? holder).focus({ preventScroll: true });
+}
+
+/** Offer values with their texts in a select; it is left alone if it offers them already, because it may be open. */
+export function offer(select, values) {
+  const key = JSON.stringify(values);
+  if (select.dataset.offered === key) return;
+  select.dataset.offered = key;
+  select.replaceChildren(...values.map(([value, text]) => element("option", { value }, plain(text).slice(0, 60))));
 }
 
 const SVG = "http://www.w3.org/2000/svg";

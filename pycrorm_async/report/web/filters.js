@@ -1,7 +1,7 @@
 // Keeps in the address of the page which episodes are chosen, and shows it as a row of controls above them.
 
 import { causeName } from "./counts.js";
-import { element, plain } from "./dom.js";
+import { element, offer, plain } from "./dom.js";
 
 const OPTIONS_MAX = 200;
 const DAY_S = 86_400;
@@ -77,15 +77,10 @@ export class Filters {
       const counts = new Map();
       for (const each of episodes) for (const value of valuesOf(each)) counts.set(value, (counts.get(value) ?? 0) + 1);
       const sorted = name === "version" ? [...counts].reverse() : [...counts].sort(([, one], [, other]) => other - one);
-      const values = sorted.slice(0, OPTIONS_MAX).map(([value]) => value);
-      const key = values.join("\n");
+      const values = sorted.slice(0, OPTIONS_MAX).map(([value]) => [value, value]);
+      if (name === "version") values.push(...values.map(([value]) => [`${SINCE}${value}`, `since ${value}`]));
       const control = this.controls.get(name);
-      if (control.dataset.values === key) continue;
-      control.dataset.values = key;
-      const option = (value, text) => element("option", { value }, plain(text).slice(0, 60));
-      const options = values.map((value) => option(value, value));
-      if (name === "version") options.push(...values.map((value) => option(`${SINCE}${value}`, `since ${value}`)));
-      control.replaceChildren(option("", `any ${name}`), ...options);
+      offer(control, [["", `any ${name}`], ...values]);
       control.hidden = values.length === 0;
     }
   }

@@ -1,7 +1,7 @@
 // Groups episodes by robot, plan, week or software version, with the success of each group, and compares two of them.
 
 import { actionsOf, causesOf, differenceOf, secondsOf, triesOf } from "./counts.js";
-import { duration, element, recorded, svg } from "./dom.js";
+import { duration, element, offer, recorded, replaceIn, svg } from "./dom.js";
 import { FACETS } from "./filters.js";
 import { interval95, rateText } from "./success.js";
 
@@ -50,47 +50,46 @@ export function intervalPicture(good, tries) {
   return picture;
 }
 
-const choice = (label, values, value, onChoose) => {
-  const select = element("select", { "aria-label": label });
-  select.append(...values.map(([each, text]) => element("option", { value: each }, text)));
-  select.value = value;
-  select.addEventListener("input", () => onChoose(select.value));
-  return select;
-};
-
 export class Groups {
   constructor(holder, settings) {
-    Object.assign(this, { holder, settings });
+    this.settings = settings;
+    this.by = element("select", { "aria-label": "group by", oninput: () => settings.set({ by: this.by.value, vs: [] }) });
+    this.of = element("select", { "aria-label": "success of", oninput: () => settings.set({ of: this.of.value }) });
+    this.measure = element("span", {}, " success of ", this.of);
+    this.content = element("div", {});
+    holder.append(element("h2", {}, "Groups ", this.by, this.measure), this.content);
   }
 
   show(episodes) {
     const { settings } = this;
     const by = settings.get("by") in GROUPINGS ? settings.get("by") : "";
     const kinds = Object.keys(GROUPINGS).filter((each) => each === by || each in IN_TIME || episodes.some((other) => GROUPINGS[each](other).length > 0));
-    const groupings = [["", "no groups"], ...kinds.map((each) => [each, `by ${each}`])];
-    const head = element("h2", {}, "Groups ", choice("group by", groupings, by, (value) => settings.set({ by: value, vs: [] })));
-    if (by === "") return this.holder.replaceChildren(head);
+    offer(this.by, [["", "no groups"], ...kinds.map((each) => [each, `by ${each}`])]);
+    this.by.value = by;
+    this.measure.hidden = by === "";
+    if (by === "") return this.content.replaceChildren();
     const types = [...actionsOf(episodes).keys()];
     const type = settings.get("of");
     if (type && !types.includes(type)) types.push(type);
-    head.append(" success of ", choice("success of", [["", "episodes"], ...types.map((each) => [each, each])], type, (value) => settings.set({ of: value })));
+    offer(this.of, [["", "episodes"], ...types.map((each) => [each, each])]);
+    this.of.value = type;
     const groups = groupsOf(episodes, by);
     const shown = by in IN_TIME ? groups.slice(-GROUPS_MAX) : groups.slice(0, GROUPS_MAX);
     const chosen = settings.values.getAll("vs");
     const rows = shown.map(([name, members]) => this.#row(by, name, members, type, chosen));
     const took = type === "" ? "median time" : "mean time";
     const titles = ["", by, "episodes", type === "" ? "succeeded" : "succeeded, of tries", took];
-    const table = element("table", {}, element("thead", {}, element("tr", {}, ...titles.map((each) => element("th", { scope: "col" }, each)))), element("tbody", {}, ...rows));
+    const table = element("table", {}, element("thead", {}, element("tr", {}, ...titles.map((each) => (each === "" ? element("td") : element("th", { scope: "col" }, each))))), element("tbody", {}, ...rows));
     const left = groups.length - shown.length;
     const notes = [left > 0 ? `${left} other groups. ` : "", chosen.length < 2 ? "Mark two groups to compare them." : ""].join("");
     const compared = chosen.length === 2 ? comparison(chosen.map((name) => [name, new Map(groups).get(name) ?? []])) : [];
-    return this.holder.replaceChildren(head, table, element("p", { class: "quiet" }, notes), ...compared);
+    return replaceIn(this.content, table, element("p", { class: "quiet" }, notes), ...compared);
   }
 
   #row(by, name, members, type, chosen) {
     const [good, tries] = triesOf(members, type);
     const seconds = secondsOf(members, type);
-    const mark = element("input", { type: "checkbox", "aria-label": `compare ${name}` });
+    const mark = element("input", { type: "checkbox", "data-key": `compare ${name}`, "aria-label": `compare ${name}` });
     mark.checked = chosen.includes(name);
     mark.addEventListener("input", () => {
       const others = chosen.filter((each) => each !== name);

@@ -12,6 +12,8 @@ const CAUSES_MAX = 15;
 const ACTIONS_MAX = 20;
 const ROWS_AT_ONCE = 100; // with them a filter is drawn in 0.1 s
 const LINKS_MAX = 3;
+const PAUSE = 4; // times the time of the last drawing
+const PAUSE_MAX_MS = 2000;
 const SPREAD = 30; // from so many times the shortest duration on, the bars of durations grow by a factor
 
 const part = (name) => document.getElementById(name);
@@ -85,11 +87,16 @@ class Overview {
     this.total += entries.size - this.episodes.length;
     this.episodes = [...entries.values()].sort((one, other) => one.number - other.number);
     this.filters.offer(this.episodes);
-    this.#draw();
+    if (this.waiting) return;
+    this.waiting = true; // a long list must not keep the browser busy, whatever the rate of parts
+    setTimeout(() => this.#draw(), Math.min(PAUSE * this.took, PAUSE_MAX_MS));
   }
 
   #draw() {
+    const began = performance.now();
+    this.waiting = false;
     const { episodes, total } = this;
+    for (const name of ["filters", "groups"]) part(name).hidden = episodes.length === 0;
     this.filters.show();
     this.chosen = this.filters.chosen(episodes);
     const { chosen } = this;
@@ -112,6 +119,7 @@ class Overview {
     this.#actions();
     this.#causes();
     this.#table();
+    this.took = performance.now() - began;
   }
 
   /** What each running episode does now; a file has none, because it cannot follow them. */
@@ -164,7 +172,7 @@ class Overview {
       const cells = [element("td", { class: "named" }, name), element("td", { class: "fixed" }, rateText(good, tries), intervalPicture(good, tries))];
       return element("tr", {}, ...cells, element("td", { class: "number", title: "mean time" }, count > 0 ? duration(seconds / count) : ""));
     });
-    part("actions").replaceChildren(...(rows.length > 0 ? [element("h2", {}, "Success of actions"), element("table", {}, ...rows)] : []));
+    replaceIn(part("actions"), ...(rows.length > 0 ? [element("h2", {}, "Success of actions"), element("table", {}, ...rows)] : []));
   }
 
   /** Why actions failed, with links to the newest episodes in which they did. */
@@ -187,8 +195,7 @@ class Overview {
     });
     const left = causes.length - rows.length;
     const content = rows.length > 0 ? element("table", {}, ...rows) : element("p", { class: "quiet" }, "Nothing failed.");
-    part("reasons").replaceChildren(element("h2", {}, "Failures by cause"), content);
-    if (left > 0) part("reasons").append(element("p", { class: "quiet" }, `${left} other causes`));
+    replaceIn(part("reasons"), element("h2", {}, "Failures by cause"), content, left > 0 ? element("p", { class: "quiet" }, `${left} other causes`) : "");
   }
 
   #table() {
