@@ -15,8 +15,9 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
-from types import BuiltinMethodType, MethodWrapperType, ModuleType
+from types import BuiltinMethodType, MethodWrapperType, ModuleType, NoneType
 from typing import TYPE_CHECKING, Any, Final
 
 
@@ -92,6 +93,15 @@ def _event_values(records: Sequence[Sequence[Any]], number: int) -> tuple[Any, .
     return tuple([value for each in records for value in (number, *each[2:-1], each[-1].decode())])
 
 
+def _row_values(rows: list[Any], null: Any) -> tuple[Any, ...]:
+    # Three rows show whether others are worth a search; a value that is not found is bound as it is.
+    kinds = {type(each) for row in (rows[0], rows[len(rows) // 2], rows[-1]) for each in row} if rows else set()
+    values = chain.from_iterable(rows)
+    if bool in kinds:
+        return tuple([null if each is None else 0 if each is False else 1 if each is True else each for each in values])
+    return tuple([null if each is None else each for each in values] if NoneType in kinds else values)
+
+
 if TYPE_CHECKING:
     Tail = PythonTail
 else:
@@ -108,3 +118,8 @@ and for a scan, else None: the open episodes, which the call updates, and a list
 event_values: Final[Callable[[list[Any], int], tuple[Any, ...]]] = getattr(_compiled, "event_values", _event_values)
 """Return the values of the rows of these records, one row after the other: the number, then those from the sequence on,
 with the payload as text."""
+
+row_values: Final[Callable[[list[Any], Any], tuple[Any, ...]]] = getattr(_compiled, "row_values", _row_values)
+"""Return the values of rows of equal length, one row after the other, with `null` for None and 0 and 1 for booleans.
+
+The Python core may leave some None and booleans as they are, which a driver stores alike and binds more slowly."""

@@ -455,6 +455,32 @@ failed:
     return NULL;
 }
 
+/* row_values(rows, null) -> the values of the rows, one row after the other, with `null` for None and 0 and 1 for
+ * booleans */
+static PyObject *row_values(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    PyObject *rows, *null;
+    if (!PyArg_ParseTuple(arguments, "O!O", &PyList_Type, &rows, &null)) return NULL;
+    Py_ssize_t count = PyList_Size(rows), columns = count ? PySequence_Size(PyList_GetItem(rows, 0)) : 0;
+    if (columns < 0) return NULL;
+    PyObject *zero = PyLong_FromLong(0), *one = PyLong_FromLong(1), *values = PyTuple_New(columns * count);
+    int failed = !zero || !one || !values;
+    for (Py_ssize_t at = 0; !failed && at < count; at++) {
+        PyObject *row = PySequence_Tuple(PyList_GetItem(rows, at));
+        failed = !row || PyTuple_Size(row) != columns;
+        if (row && failed) PyErr_SetString(PyExc_ValueError, "the rows differ in length");
+        for (Py_ssize_t n = 0; !failed && n < columns; n++) {
+            PyObject *value = PyTuple_GetItem(row, n);
+            value = value == Py_None ? null : value == Py_False ? zero : value == Py_True ? one : value;
+            PyTuple_SetItem(values, columns * at + n, Py_NewRef(value));
+        }
+        Py_XDECREF(row);
+    }
+    Py_XDECREF(zero);
+    Py_XDECREF(one);
+    if (failed) Py_CLEAR(values);
+    return values;
+}
+
 /* === module ==================================================================================================== */
 
 #ifndef SOURCE
@@ -474,6 +500,7 @@ static PyObject *py_crc32(PyObject *Py_UNUSED(module), PyObject *arguments) { /*
 static PyMethodDef methods[] = {
     {"take_records", take_records, METH_VARARGS, NULL},
     {"event_values", event_values, METH_VARARGS, NULL},
+    {"row_values", row_values, METH_VARARGS, NULL},
     {"crc32", py_crc32, METH_VARARGS, NULL},
     {0}};
 

@@ -16,7 +16,6 @@ from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from itertools import chain
 from pathlib import Path
-from types import NoneType
 from typing import Any, ClassVar, Final, TypeVar
 
 import msgspec
@@ -316,7 +315,9 @@ _NULL: Final = float("nan")
 def bound(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[tuple[str, tuple[Any, ...]]]:
     """Generate VALUES lists and their parameters, some rows at a time. The lists differ by their length alone."""
     for part in _parts(rows, columns):
-        yield _marks(len(part), columns), _values(part)
+        # Binding None or a boolean takes 0.28 µs, because the driver looks for an adapter; a number takes 0.04 µs. Half
+        # of a node's row is None.
+        yield _marks(len(part), columns), core.row_values([*part], _NULL)
 
 
 def _marks(rows: int, columns: int) -> str:
@@ -331,18 +332,3 @@ def _parts(rows: _Rows, columns: int) -> Iterator[_Rows]:
             size //= 2
         yield rows[start : start + size]  # type: ignore[misc]  # a slice has the type of its sequence
         start += size
-
-
-def _values(rows: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
-    """Return the values to bind, row after row.
-
-    Binding None or a boolean takes 0.28 µs, because the driver looks for an adapter; a number takes 0.04 µs. Half of a
-    node's row is None. Three rows show whether others are worth a search; a value that is not found is bound as it is.
-    """
-    kinds = {type(each) for row in (rows[0], rows[len(rows) // 2], rows[-1]) for each in row}
-    values = chain.from_iterable(rows)
-    if bool in kinds:
-        return tuple(
-            [_NULL if each is None else 0 if each is False else 1 if each is True else each for each in values]
-        )
-    return tuple([_NULL if each is None else each for each in values] if NoneType in kinds else values)

@@ -445,6 +445,33 @@ def test_values_of_records_that_no_database_holds_are_refused_by_both_cores() ->
             core.event_values([wrong], 1)
 
 
+def exact(values: tuple[Any, ...], null: float) -> list[tuple[type, Any]]:
+    """Return values with their types, so that 1, 1.0 and True differ, as both cores may bind them."""
+    plain = [null if each is None else int(each) if isinstance(each, bool) else each for each in values]
+    return [(type(each), each) for each in plain]
+
+
+@compiled
+@given(st.integers(0, 5), st.data())
+def test_both_cores_bind_equal_values_of_rows(columns: int, data: st.DataObject) -> None:
+    value = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | st.binary()
+    rows = data.draw(st.lists(st.tuples(*[value] * columns)))
+    values = core.row_values(rows, -1.5)
+    assert exact(values, -1.5) == exact(core._row_values(rows, -1.5), -1.5)
+    assert not any(each is None or isinstance(each, bool) for each in values)
+    assert core.row_values([[*each] for each in rows], -1.5) == values
+
+
+@compiled
+def test_rows_of_different_lengths_have_no_values() -> None:
+    for other in ((1,), (1, 2, 3)):
+        with pytest.raises(ValueError, match="the rows differ in length"):
+            core.row_values([(1, 2), other], 0.0)
+    with pytest.raises(TypeError):
+        core.row_values([(1, 2), 3], 0.0)
+    assert core.row_values([], 0.0) == ()
+
+
 # === building =================================================================================================
 
 
