@@ -111,7 +111,7 @@ def export(
         file_format = file_format or "parquet"
         out = Path(f"{'-'.join(what or ['episodes'])[:100].replace('/', '-')}.{file_format}")
     options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps, "no_formulas": no_formulas}
-    options["images"] = _size(images)
+    options["images"] = None if images is None else output.parse_size("--images", images)
     options["arguments"] = _arguments(what[0], arguments or []) if what else {}
 
     async def write(report_progress: ProgressCallback | None) -> Exported:
@@ -138,16 +138,6 @@ def export(
 
 def _unit(file_format: str) -> str:
     return "rows" if format_named(file_format).holds == "rows" else "events"
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    """Return width and height of `320x240`."""
-    if text is None:
-        return None
-    width, separator, height = text.partition("x")
-    if not (separator and width.isdecimal() and height.isdecimal()):
-        raise CallerError(f"--images must be WIDTHxHEIGHT, as in 320x240, got {text!r}")
-    return int(width), int(height)
 
 
 def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:

@@ -257,9 +257,9 @@ def print_rows(form: Form, document: Any, title: str, columns: Sequence[str], ro
         print_table(title, columns, rows, as_csv=form.as_csv)
 
 
-# === since ====================================================================================================
+# === values ===================================================================================================
 #
-# Parse the earliest start of an episode, as a date, a time, or an age.
+# Parse the values of options: the earliest start of an episode, as a date, a time, or an age; and sizes of pictures.
 
 _AGE = re.compile(r"(\d{1,6})\s*(min|h|d|w|y)")
 _UNITS = {
@@ -291,3 +291,11 @@ def parse_since(text: str, now: datetime | None = None) -> datetime:
             " or an age such as 90min, 12h, 7d, 2w"
         ) from None
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+
+def parse_size(option: str, text: str) -> tuple[int, int]:
+    """Return width and height, in pixels, of a text such as 640x480. Raises `CallerError`."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise CallerError(f"{option} takes width and height in pixels, such as 640x480, got {text!r}")
+    return int(width), int(height)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import EpisodeArgument, JsonOption, print_json, print_line
+from pycrorm_async.cli.output import EpisodeArgument, JsonOption, parse_size, print_json, print_line
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.picture import picture as draw
@@ -47,7 +47,7 @@ def picture(
     as_json: JsonOption = False,
 ) -> None:
     """Write the scene at a moment as PNG, drawn from the recorded geometry without a display."""
-    width, height = _size(size)
+    width, height = parse_size("--size", size)
     if at is not None:
         parse_moment(at, "--at")
     if out is not None:
@@ -68,10 +68,3 @@ def picture(
         print_json({"file": path, "bytes": path.stat().st_size, "width": width, "height": height})
     else:
         print_line(path)
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise CallerError(f"--size takes width and height in pixels, such as 640x480, got {text!r}")
-    return int(width), int(height)

@@ -15,11 +15,11 @@ import subprocess
 import sys
 import sysconfig
 import traceback
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import nullcontext, redirect_stdout, suppress
+from collections.abc import Awaitable, Callable
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -39,14 +39,8 @@ from pycrorm_async.world.engines import ENGINES, VARIABLE, engine_class
 
 _DRAIN_WAIT_S = 2
 """Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""
-_SAMPLE_INTERVAL_MS = range(1, 86_400_001)
+_SAMPLE_INTERVAL_MS_MAX = 86_400_000
 """Bounds `--sample-interval-ms`: a day, longer than any motion."""
-
-
-def _one_of(choices: Any, purpose: str) -> Any:
-    """Return an option of one of the literals; `_choice` checks it, so that a wrong one is reported in one line."""
-    names = list(get_args(choices))
-    return typer.Option(metavar="|".join(names), autocompletion=lambda: names, help=purpose)
 
 
 def run(
@@ -69,24 +63,23 @@ def run(
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
     sample_interval_ms: Annotated[
-        str | None,
+        int | None,
         typer.Option(
-            metavar="N", help="Sample the robot's state every N milliseconds while a motion runs; default: no samples."
+            metavar="N",
+            min=1,
+            max=_SAMPLE_INTERVAL_MS_MAX,
+            help="Sample the robot's state every N milliseconds while a motion runs; default: no samples.",
         ),
     ] = None,
     on_unrecordable: Annotated[
-        str,
-        _one_of(
-            OnUnrecordable, "A parameter that cannot be recorded is recorded as missing, or its perform is refused."
-        ),
+        OnUnrecordable,
+        typer.Option(help="A parameter that cannot be recorded is recorded as missing, or its perform is refused."),
     ] = "record_missing",
     on_full: Annotated[
-        str,
-        _one_of(OnFull, "A node that starts while the spool is full waits for space, or fails."),
+        OnFull, typer.Option(help="A node that starts while the spool is full waits for space, or fails.")
     ] = "wait",
     record_meshes: Annotated[
-        str,
-        _one_of(RecordMeshes, "Record the meshes of objects as boxes, or also the files."),
+        RecordMeshes, typer.Option(help="Record the meshes of objects as boxes, or also the files.")
     ] = "boxes",
     show_traceback: Annotated[
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
@@ -111,10 +104,10 @@ def run(
     settings = Settings(
         writer=writer,
         file_access=file_access,
-        sample_interval_ms=_milliseconds("--sample-interval-ms", sample_interval_ms),
-        on_unrecordable=_choice("--on-unrecordable", on_unrecordable, get_args(OnUnrecordable)),
-        on_full=_choice("--on-full", on_full, get_args(OnFull)),
-        record_meshes=_choice("--record-meshes", record_meshes, get_args(RecordMeshes)),
+        sample_interval_ms=sample_interval_ms,
+        on_unrecordable=on_unrecordable,
+        on_full=on_full,
+        record_meshes=record_meshes,
     )
     tags = checked_tags(tag or ())
     if engine is not None:
@@ -164,24 +157,6 @@ def run(
         stderr.print("".join(traceback.format_exception(failure)), markup=False)
     problem(f"the plan {loaded.name} failed: {_one_line(failure)}")
     return 1
-
-
-def _choice(option: str, value: str, choices: Sequence[Any]) -> Any:
-    """Return the value if it is one of the choices. Raises `CallerError`, which is printed as one line."""
-    if value not in choices:
-        raise CallerError(f"{option} is {value!r}: use {' or '.join(map(repr, choices))}")
-    return value
-
-
-def _milliseconds(option: str, text: str | None) -> int | None:
-    """Parse an interval. Raises `CallerError`."""
-    if text is None:
-        return None
-    with suppress(ValueError):
-        if int(text) in _SAMPLE_INTERVAL_MS:
-            return int(text)
-    first, last = _SAMPLE_INTERVAL_MS[0], _SAMPLE_INTERVAL_MS[-1]
-    raise CallerError(f"{option} is {text!r}: it must be a whole number of milliseconds from {first} to {last:,}")
 
 
 @dataclass

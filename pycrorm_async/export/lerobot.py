@@ -58,7 +58,7 @@ async def write_lerobot(job: Job, folder: Path) -> Written:
     episodes, unreadable, before = job.selection.episodes, dict[int, str](), 0
     for each in episodes:
         try:
-            episode = await read_episode(job.reading, each, job.reporter("reading", before))
+            episode = await read_episode(ExportedEpisode, job.reading, each, job.reporter("reading", before))
         except (LogDamaged, DatabaseForeign) as error:
             unreadable[each.number] = str(error)
             if len(unreadable) == len(episodes):

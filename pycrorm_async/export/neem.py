@@ -35,7 +35,7 @@ from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ance
 from pycrorm_async.export import neem_vocabulary as vocabulary
 from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.neem_vocabulary import DUL, OWN, RDF_TYPE, RDFS, SOMA
-from pycrorm_async.export.scenes import read_episode_as
+from pycrorm_async.export.scenes import read_episode
 from pycrorm_async.export.traces import TracedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import ReplayedNode
@@ -237,7 +237,7 @@ async def write_neem(job: Job, folder: Path) -> Written:
     if len(job.selection.episodes) != 1:
         raise CallerError(f"a NEEM holds one episode, got {len(job.selection.episodes)}: name one")
     [covered] = job.selection.episodes
-    episode = await read_episode_as(NeemEpisode, job.reading, covered, job.reporter("reading"))
+    episode = await read_episode(NeemEpisode, job.reading, covered, job.reporter("reading"))
     moves = [*episode.moves, *[each async for each in _streamed(episode, job.reading)]]
     moves.sort(key=lambda each: each.at)
     facts = [*triples_of(episode)]

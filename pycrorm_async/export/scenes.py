@@ -145,13 +145,6 @@ E = TypeVar("E", bound=ExportedEpisode)
 
 
 async def read_episode(
-    reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
-) -> ExportedEpisode:
-    """Read an episode as an `ExportedEpisode`."""
-    return await read_episode_as(ExportedEpisode, reading, covered, report_events)
-
-
-async def read_episode_as(
     kind: type[E], reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
 ) -> E:
     """Read an episode up to the event `covered.events`. `report_events` gets the number of events read so far.
@@ -704,7 +697,7 @@ async def write_scene(write: _WriteScene, job: Job, path: Path) -> Written:
         count = len(job.selection.episodes)
         raise CallerError(f"a file of the format {job.file_format} holds one episode, got {count}: name one")
     [covered] = job.selection.episodes
-    episode = await read_episode(job.reading, covered, job.reporter("reading"))
+    episode = await read_episode(ExportedEpisode, job.reading, covered, job.reporter("reading"))
     objects = await scene_objects(job.reading, episode)
     report = job.reporter("writing")
     # A cancelled task waits for the end of the thread: a file that is deleted while it writes would crash the process.

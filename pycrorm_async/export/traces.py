@@ -24,7 +24,7 @@ import msgspec
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Happening, NodeEnded, ObjectMoved, Observed
 from pycrorm_async.export.formats import Format, Job, Written
-from pycrorm_async.export.scenes import ExportedEpisode, read_episode_as
+from pycrorm_async.export.scenes import ExportedEpisode, read_episode
 from pycrorm_async.query.replay import ReplayedNode, ReplayTime
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -272,7 +272,7 @@ async def _write(document_of: Callable[[TracedEpisode], dict[str, Any]], job: Jo
     rows, before = 0, 0
     with path.open("wb") as file:
         for covered in job.selection.episodes:
-            episode = await read_episode_as(TracedEpisode, job.reading, covered, job.reporter("reading", before))
+            episode = await read_episode(TracedEpisode, job.reading, covered, job.reporter("reading", before))
             document = await run_to_completion(asyncio.to_thread(document_of, episode))
             file.write(encoded(document) + b"\n")
             rows += len(episode.nodes)
