@@ -76,6 +76,7 @@ if TYPE_CHECKING:
     from pycrorm_async.recall import Answer, Recall
     from pycrorm_async.record import Episode
     from pycrorm_async.report import Report
+    from pycrorm_async.report.pictures import Images
 
 
 # === memory ===================================================================================================
@@ -455,9 +456,10 @@ class Memory:
         force: bool = False,
         first: int | None = None,
         last: int | None = None,
+        images: Images = "thumbs",
     ) -> Report:
         """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
-        return await reporting.report(self.reading, episode, path, force=force, first=first, last=last)
+        return await reporting.report(self.reading, episode, path, force=force, first=first, last=last, images=images)
 
     async def picture(self, /, episode: AskedEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
         """Return the scene of an episode at a moment as PNG, up to the last flush.

@@ -15,6 +15,7 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
 from pycrorm_async.report.overview import Plot, overview
+from pycrorm_async.report.pictures import Images
 from pycrorm_async.report.write import report as write_report
 
 
@@ -49,6 +50,13 @@ def report(
     last: Annotated[
         int | None, typer.Option("--to", min=1, metavar="SEQUENCE", help="Show events up to this one.")
     ] = None,
+    images: Annotated[
+        Images,
+        typer.Option(
+            help="What the page has of observed images, depth maps and point clouds: nothing; small pictures of at most"
+            " 200; or the whole contents, up to 24 MB, and small pictures of the others."
+        ),
+    ] = "thumbs",
     place: Place,
     as_json: output.JsonOption = False,
 ) -> int:
@@ -70,8 +78,9 @@ def report(
         raise CallerError("--from and --to choose events of one episode: name it instead of --all")
     if episode is None:
         plots = [_plot(each) for each in plot or ()]
-        return _write_overview(out or Path("episodes.html"), choice, plots, place, force=force, as_json=as_json)
-    _write_episode(episode, out, (first, last), place, force=force, as_json=as_json)
+        file = out or Path("episodes.html")
+        return _write_overview(file, choice, plots, place, force=force, images=images, as_json=as_json)
+    _write_episode(episode, out, (first, last), place, force=force, images=images, as_json=as_json)
     return 0
 
 
@@ -83,9 +92,16 @@ def _plot(text: str) -> Plot:
 
 
 def _write_overview(
-    out: Path, choice: EpisodeChoice, plots: list[Plot], place: Place, *, force: bool, as_json: bool
+    out: Path,
+    choice: EpisodeChoice,
+    plots: list[Plot],
+    place: Place,
+    *,
+    force: bool,
+    images: Images,
+    as_json: bool,
 ) -> int:
-    written = place.read(lambda reading: overview(reading, out, choice=choice, plots=plots, force=force))
+    written = place.read(lambda reading: overview(reading, out, choice=choice, plots=plots, force=force, images=images))
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
         output.print_json({"file": written.path, **counts, "unreadable": written.unreadable})
@@ -111,10 +127,13 @@ def _write_episode(
     place: Place,
     *,
     force: bool,
+    images: Images,
     as_json: bool,
 ) -> None:
     first, last = window
-    written = place.read(lambda reading: write_report(reading, episode, out, force=force, first=first, last=last))
+    written = place.read(
+        lambda reading: write_report(reading, episode, out, force=force, first=first, last=last, images=images)
+    )
     size = written.path.stat().st_size
     if as_json:
         shown = {"first": written.first, "last": written.last, "events": written.events}

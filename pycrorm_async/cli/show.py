@@ -314,8 +314,10 @@ def tree_of(
     """Return the tree that `print_tree` prints; None if there are no nodes. With `no_wrap` each node takes one line."""
     drawn: dict[int, Tree] = {}
     root: Tree | None = None
+    nodes = list(nodes)
+    robots = _acting_robots(nodes)
     for node in nodes:
-        line = _line(node, events=events, full=full)
+        line = _line(node, robots.get(node.id), events=events, full=full)
         if no_wrap:
             line.no_wrap, line.overflow = True, "ellipsis"
         parent = drawn.get(node.parent_id) if node.parent_id is not None else None
@@ -326,13 +328,25 @@ def tree_of(
     return root
 
 
-def _line(node: named_queries.NodeSummary, *, events: bool, full: bool) -> Text:
-    return Text.assemble(*_parts(node, events=events, full=full))
+def _acting_robots(nodes: Sequence[named_queries.NodeSummary]) -> dict[int, str]:
+    """Return by id the robots of the nodes at which another one begins to act; none if one robot did everything."""
+    robots = {node.id: node.robot for node in nodes}
+    if len({each for each in robots.values() if each}) < 2:
+        return {}
+    return {node.id: node.robot for node in nodes if node.robot and node.robot != robots.get(node.parent_id or 0)}
 
 
-def _parts(node: named_queries.NodeSummary, *, events: bool, full: bool) -> Iterator[tuple[str, str]]:
-    """Yield the texts of a node's line, each with its style."""
+def _line(node: named_queries.NodeSummary, robot: str | None, *, events: bool, full: bool) -> Text:
+    return Text.assemble(*_parts(node, robot, events=events, full=full))
+
+
+def _parts(
+    node: named_queries.NodeSummary, robot: str | None, *, events: bool, full: bool
+) -> Iterator[tuple[str, str]]:
+    """Yield the texts of a node's line, each with its style; `robot` is named if there is one."""
     yield visible(node.dtype or node.kind), ""
+    if robot is not None:
+        yield f"  by {visible(robot)}", "bold"
     if node.parameters:
         yield f"  {visible(parameters_text(node.parameters, full=full, exact=full))}", "dim"
     yield f"  {node.status}", _STYLES.get(node.status, "red")
@@ -368,10 +382,11 @@ def plain_lines(
         followed.append(has_later_sibling[node.depth])
         has_later_sibling[node.depth] = True
     bars: list[str] = []
+    robots = _acting_robots(nodes)
     for node, is_followed in zip(nodes, reversed(followed), strict=True):
         del bars[max(node.depth - 1, 0) :]
         before = "".join(bars) + (fork if is_followed else end) if node.depth else ""
-        yield before + "".join(text for text, _ in _parts(node, events=events, full=full))
+        yield before + "".join(text for text, _ in _parts(node, robots.get(node.id), events=events, full=full))
         if node.depth:
             bars.append(continued if is_followed else blank)
 

@@ -197,12 +197,16 @@ def _node_differences(first: Sequence[NodeSummary], second: Sequence[NodeSummary
     by_path = [_by_path(each) for each in (first, second)]
     differences: list[Difference] = []
     same = 0
+    acting: dict[_Path, tuple[str | None, str | None]] = {}
     order = [*by_path[0], *(path for path in by_path[1] if path not in by_path[0])]
     below = [_counted_below(each) for each in by_path]
     for path in order:
         one, other = (each.get(path) for each in by_path)
         if one is not None and other is not None:
             own = list(_differences_of(path, one, other))
+            robots = acting[path] = one.robot, other.robot
+            if robots[0] != robots[1] and robots != acting.get(path[:-1]):  # not again at each node inside
+                own.append(Difference("node", _path_text(path), "robot", *robots, one.id, other.id))
             differences += own
             same += not own
         elif len(path) == 1 or all(path[:-1] in each for each in by_path):

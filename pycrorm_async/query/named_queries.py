@@ -127,6 +127,7 @@ class NodeSummary:
         considered, offered: number of places that location designators checked for it, and of those they offered.
         detected: number of percepts that it had.
         start_ns: of the robot's monotonic clock, which only the times of one episode are compared by.
+        robot: the name of the robot that acted; None if there is none.
     """
 
     id: int
@@ -150,6 +151,7 @@ class NodeSummary:
     detected: int = 0
     start_ns: int = field(default=0, compare=False)
     outcome: str | None = field(default=None, compare=False)
+    robot: str | None = field(default=None, compare=False)
 
 
 _OF_EPISODE = {each.name for each in fields(EpisodeSummary)} & {*orm.ProcessMetaData.__table__.c.keys()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 from xml.etree.ElementTree import ParseError
 
 import numpy as np
@@ -106,13 +106,31 @@ def object_model(description: DescriptionDeclared, *, drawn: frozenset[str] = fr
         return point_model(f"its description cannot be read: {error}")
 
 
+_ROBOT_SHAPES: Final = [
+    ["cylinder", [0.28, 0.3], [0, 0, 0.15], [0, 0, 0], [0.35, 0.38, 0.43, 1]],
+    ["cylinder", [0.16, 0.9], [0, 0, 0.75], [0, 0, 0], [0.55, 0.59, 0.66, 1]],
+    ["sphere", [0.14], [0, 0, 1.34], [0, 0, 0], [0.35, 0.38, 0.43, 1]],
+    ["box", [0.5, 0.09, 0.09], [0.3, 0, 1.0], [0, 0, 0], [0.95, 0.6, 0.1, 1]],
+    ["box", [0.8, 0.03, 0.03], [0.4, 0, 0.02], [0, 0, 0], [0.85, 0.15, 0.15, 1]],
+    ["box", [0.03, 0.8, 0.03], [0, 0.4, 0.02], [0, 0, 0], [0.15, 0.65, 0.2, 1]],
+    ["box", [0.03, 0.03, 0.3], [0, 0, 1.6], [0, 0, 0], [0.15, 0.35, 0.9, 1]],
+]
+"""A body 1.5 m high that stands at the robot's pose; a pointer shows its heading, and bars its x, y and z axes."""
+
+
 def assumed_model(name: str, object_type: str, joints: set[str]) -> dict[str, Any]:
-    """Return the model of an object without a recorded description: the built-in shape if it fits, or a point."""
+    """Return the model of an object without a recorded description.
+
+    It is the built-in shape if that fits, otherwise a body with a heading and axes for a robot, or a point.
+    """
     reason = "its description was not recorded"
     if object_type in ObjectType.__members__:
         urdf = built_in_that_fits(name, ObjectType[object_type], joints=joints, links=set())
         if urdf is not None:
             return {**_document(read_model(urdf)), "assumed": f"the built-in shape, because {reason}"}
+    if object_type == ObjectType.ROBOT.name:
+        assumed = f"a body with its heading, because {reason}"
+        return {"root": "", "shapes": {"": _ROBOT_SHAPES}, "joints": [], "assumed": assumed}
     return point_model(reason)
 
 

@@ -29,10 +29,11 @@ def parameters_text(parameters: Mapping[str, Any], *, full: bool = False, exact:
     >>> parameters_text({"arm": "LEFT", "target": {"position": [0.6, 0.4, 0.0], "orientation": [0, 0, 0, 1]}})
     'arm=LEFT target=(0.60, 0.40, 0.00)'
     """
-    return " ".join(f"{name}={_value_text(value, full=full, exact=exact)}" for name, value in parameters.items())
+    return " ".join(f"{name}={value_text(value, full=full, exact=exact)}" for name, value in parameters.items())
 
 
-def _value_text(value: Any, *, full: bool, exact: bool) -> str:
+def value_text(value: Any, *, full: bool = False, exact: bool = False) -> str:
+    """Format a value on one line, as `parameters_text` does."""
     if isinstance(value, dict) and _is_position(value.get("position")):
         if exact:
             return _pose_text(value)

@@ -24,10 +24,12 @@ from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.reasons import reason_of
+from pycrorm_async.query.observed_images import contents_in
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay, ReplayedWorld
 from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
-from pycrorm_async.query.text import parameters_text
+from pycrorm_async.query.text import parameters_text, value_text
+from pycrorm_async.report.pictures import Images, ObservedContent, pictures_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -36,6 +38,8 @@ _TEXTS_CHARACTERS = 6_000_000
 """Bounds the characters of all texts of a page together, so that it stays below 20 MB."""
 _TEXT_SHORTEST, _TEXT_LONGEST = 80, 20_000
 """Bounds the characters of one text on the page, when there are many long ones and when there are few."""
+_WHOLE_CHARACTERS = 1_000_000
+"""Bounds the characters of all parameters that a page has in full, so that one of 20,000 nodes stays below 3 MB."""
 _NODES_MAX = 100_000
 """Bounds the nodes of a page: it then has about 10 MB and opens in less than 3 s."""
 _NUMBERS_MAX = 1_400_000
@@ -63,11 +67,14 @@ class EpisodePage(EpisodeReplay):
         self._times: list[int] = []
         self._rows: dict[int, list[int]] = {}
         """The nodes of the page by start: `[start, end, parent]`, and the numbers of their texts."""
+        self._whole_characters = 0
         self._ended_nodes: dict[int, int] = {}
         """The event that ended a node, by the node's start; also of a node that is LOST."""
         self._listed: dict[str, list[dict[str, Any]]] = {name: [] for name in _LISTS}
         self._unlisted = dict.fromkeys(_LISTS, 0)
         self._series: dict[str, Track] = {}
+        self.contents: list[ObservedContent] = []
+        """The observed contents that can be shown as pictures, in order."""
 
     def read(self, event: StoredEvent) -> event_types.Happening | None:
         """Apply the next event, as `EpisodeReplay.read`, and keep what the page shows of it."""
@@ -77,11 +84,11 @@ class EpisodePage(EpisodeReplay):
             self._times.append(self.at.since_ns // 1000)
         match happening:
             case event_types.NodeStarted():
-                self._start_row(sequence)
+                self._start_row(sequence, happening.robot)
             case event_types.NodeEnded() if sequence < self._first:
                 del self.nodes[happening.node], self._rows[happening.node]
             case event_types.NodeEnded():
-                self._end_row(sequence, happening.node)
+                self._end_row(sequence, happening.node, happening.result)
             case event_types.EpisodeEnded(status="LOST"):
                 for start in [each for each in self._rows if each not in self._ended_nodes]:
                     self._end_row(sequence, start)
@@ -106,33 +113,55 @@ class EpisodePage(EpisodeReplay):
         else:
             self._unlisted[name] += 1
 
-    def _start_row(self, start: int) -> None:
+    def _start_row(self, start: int, robot: event_types.RobotValue | None) -> None:
         node, number = self.nodes[start], self._texts.number
-        parameters = parameters_text(self.parameters(node))
-        texts = [number(each) for each in (node.kind, self.dtype(node), parameters, node.status)]
-        self._rows[start] = [start, 0, node.parent or 0, *texts, 0, 0]
+        parameters = self.parameters(node)
+        short = parameters_text(parameters)
+        texts = [number(each) for each in (node.kind, self.dtype(node), short, node.status)]
+        acted = [number(self._robot_name(robot)), number(self._whole(parameters, short))]
+        self._rows[start] = [start, 0, node.parent or 0, *texts, 0, 0, *acted, 0]
 
-    def _end_row(self, sequence: int, start: int) -> None:
+    def _robot_name(self, robot: event_types.RobotValue | None) -> str:
+        """Return the name of the robot that acts; that of its object in events of older versions, else its type."""
+        if robot is None:
+            return ""
+        name = robot.name or (self.world.name_of(robot.object.object) if robot.object is not None else None)
+        return name or robot.object_type
+
+    def _whole(self, parameters: Mapping[str, Any], short: str) -> str:
+        """Return a line for each parameter, with its whole value; empty if `short` has it or they are too many."""
+        lines = [f"{name}={value_text(_six_digits(each), full=True, exact=True)}" for name, each in parameters.items()]
+        whole = "\n".join(lines)
+        if " ".join(lines) == short or self._whole_characters > _WHOLE_CHARACTERS:
+            return ""
+        self._whole_characters += len(whole)
+        return whole
+
+    def _end_row(self, sequence: int, start: int, result: Any = None) -> None:
         node = self.nodes[start]
         end = node.end.sequence if node.end is not None else 0
         texts = [self._texts.number(each or "") for each in (node.status, node.reason, node.message)]
-        self._rows[start] = [start, end, *self._rows[start][2:6], *texts]
+        returned = "" if result is None else _cut(value_text(_six_digits(result), full=True, exact=True))
+        self._rows[start] = [start, end, *self._rows[start][2:6], *texts, *self._rows[start][9:11]]
+        self._rows[start].append(self._texts.number(returned))
         self._ended_nodes[start] = sequence
         node.parameters = {}  # the page has them as text, and no node inside it starts any more
 
     def _observed(self, sequence: int, observed: event_types.Observed) -> None:
-        text = msgspec.json.encode(observed.values).decode()
-        if len(text) > _VALUES_MAX:
-            text = f"{text[:_VALUES_MAX]}… ({len(text) - _VALUES_MAX:,} more characters)"
+        text = _cut(msgspec.json.encode(observed.values).decode())
         entry = {"at": sequence, "node": observed.node or 0, "name": observed.name, "values": text}
         self._list("observations", entry)
+        if len(self.contents) < _LISTED_MAX:
+            found = [each for each in contents_in(observed.values) if each.kind is not None]
+            self.contents += [ObservedContent(sequence, observed.node or 0, observed.name, each) for each in found]
         for path, number in _numbers_in(observed.name, observed.values):
             self._series.setdefault(path, Track(self._first)).set(sequence, number)
 
-    def document(self, models: Mapping[str, Any], *, after: int = 0) -> dict[str, Any]:
+    def document(self, models: Mapping[str, Any], pictures: Mapping[str, Any], *, after: int = 0) -> dict[str, Any]:
         """Return the document of the events read so far, or the part of those behind event `after`.
 
-        `models` are those of the objects added behind `after`, by `model_name`.
+        `models` are those of the objects added behind `after`, by `model_name`; `pictures` those of the contents
+        observed behind it.
         """
         begin = max(after + 1 - self._first, 0)
         return {
@@ -143,14 +172,15 @@ class EpisodePage(EpisodeReplay):
             "texts": self._texts.cut(
                 _TEXTS_CHARACTERS, shortest=_TEXT_SHORTEST, longest=_TEXT_LONGEST, after=after or -1
             ),
-            "nodes": _columns(_newest(self._rows.values(), after), 9),
-            "ended": _columns([self._end_of(start) for start in self._ended_since(after)], 5),
+            "nodes": _columns(_newest(self._rows.values(), after), 12),
+            "ended": _columns([self._end_of(start) for start in self._ended_since(after)], 6),
             "models": dict(models),
             "objects": [
                 each for each in (self._object(identity, models, after) for identity in self.tracks.objects) if each
             ],
             "attachments": [each for each in self.tracks.attachments if max(each[3:]) > after],
             **{name: _behind(entries, after) for name, entries in self._listed.items()},
+            **pictures,
             "series": _tracks(self._series, after),
             "samples": {
                 str(identity): tracks
@@ -194,7 +224,7 @@ class EpisodePage(EpisodeReplay):
 
     def _end_of(self, start: int) -> list[int]:
         row = self._rows[start]
-        return [*row[:2], *row[6:]]
+        return [*row[:2], *row[6:9], row[11]]
 
     def _object(self, identity: int, models: Mapping[str, Any], after: int) -> dict[str, Any] | None:
         """Return an object, or its identity with what changed behind event `after`; None if nothing did."""
@@ -284,6 +314,23 @@ def _numbers_in(name: str, values: Any) -> list[tuple[str, float]]:
     if isinstance(values, list) and len(values) <= _ITEMS_MAX and name.count(".") < 2:
         return [pair for index, each in enumerate(values) for pair in _numbers_in(f"{name}.{index}", each)]
     return []
+
+
+def _cut(text: str) -> str:
+    left = len(text) - _VALUES_MAX
+    return text if left <= 0 else f"{text[:_VALUES_MAX]}… ({left:,} more characters)"
+
+
+def _six_digits(value: Any) -> Any:
+    """Round the numbers in a value to six digits behind the point, which the page shows of lengths and angles."""
+    match value:
+        case float():
+            return round(value, 6) + 0.0
+        case dict():
+            return {name: _six_digits(each) for name, each in value.items()}
+        case list():
+            return [_six_digits(each) for each in value]
+    return value
 
 
 def _short(value: Any) -> str:
@@ -497,7 +544,12 @@ class ObjectTracks:
 
 
 async def episode_document(
-    reading: Reading, episode: str | int, *, first: int | None = None, last: int | None = None
+    reading: Reading,
+    episode: str | int,
+    *,
+    first: int | None = None,
+    last: int | None = None,
+    images: Images = "thumbs",
 ) -> dict[str, Any]:
     """Return the document of an episode, of all its events or of those from `first` to `last`.
 
@@ -515,7 +567,7 @@ async def episode_document(
         raise CallerError(f"episode {row.number} has {row.head} events, and none from event {begin} to {last or end}")
     page = EpisodePage(row, log.address, begin)
     await read_into(page, log, log.pages(row._replace(head=end)))
-    return await document_behind(page, log)
+    return await document_behind(page, log, images=images)
 
 
 async def read_into(page: EpisodePage, log: EventLog, events: AsyncIterable[Sequence[StoredEvent]]) -> None:
@@ -531,9 +583,13 @@ async def read_into(page: EpisodePage, log: EventLog, events: AsyncIterable[Sequ
             page.read(event)
 
 
-async def document_behind(page: EpisodePage, log: EventLog, after: int = 0) -> dict[str, Any]:
+async def document_behind(
+    page: EpisodePage, log: EventLog, after: int = 0, *, images: Images = "thumbs"
+) -> dict[str, Any]:
     """Return the document of the events that were read, or the part of those behind event `after`."""
-    return page.document(await _models(log, page, after), after=after)
+    observed = page.contents[bisect_right(page.contents, after, key=lambda each: each.at) :]
+    pictures = await pictures_of(log, observed, images)
+    return page.document(await _models(log, page, after), pictures, after=after)
 
 
 async def _models(log: EventLog, page: EpisodePage, after: int) -> Mapping[str, Any]:

@@ -27,6 +27,7 @@ from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.success import PICK_UPS, Axis, success_samples, success_table
 from pycrorm_async.report.output_files import refuse_existing, write_file
+from pycrorm_async.report.pictures import Images
 from pycrorm_async.report.write import SimilarCases, asset, html_page, page_name, program, report, stream_of
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import ObjectType
@@ -55,6 +56,7 @@ async def overview(
     choice: EpisodeChoice | None = None,
     plots: Collection[Plot] = (),
     force: bool = False,
+    images: Images = "thumbs",
 ) -> Overview:
     """Write a table of all episodes, or of a choice, and pages of the newest 200 of them behind it.
 
@@ -79,10 +81,10 @@ async def overview(
     with _folder_of_pages(folder):
         shown = episodes[-_PAGES_MAX:]
         back = f"../{quote(file.name)}" if is_page else file.name
-        unreadable = await _write_pages(reading, shown, folder, back, force=force)
+        unreadable = await _write_pages(reading, shown, folder, back, force=force, images=images)
         shown = [each for each in shown if each.number not in unreadable]
         if unreadable:  # again, because some pages may link to those that are missing
-            await _write_pages(reading, shown, folder, back, force=True)
+            await _write_pages(reading, shown, folder, back, force=True, images=images)
         below = f"{quote(folder.name)}/" if is_page else ""
         pages = {each.number: f"{below}{page_name(each.number)}" for each in shown}
         document = await overview_document(reading, title, episodes, total, pages, unreadable)
@@ -105,7 +107,13 @@ def _folder_of_pages(folder: Path) -> Iterator[None]:
 
 
 async def _write_pages(
-    reading: Reading, episodes: Collection[EpisodeSummary], folder: Path, back: str, *, force: bool
+    reading: Reading,
+    episodes: Collection[EpisodeSummary],
+    folder: Path,
+    back: str,
+    *,
+    force: bool,
+    images: Images,
 ) -> dict[int, str]:
     """Write a page of each episode, with links to each other and `back`; return why some have none, by number."""
     unreadable: dict[int, str] = {}
@@ -113,7 +121,7 @@ async def _write_pages(
     for each in episodes:
         try:
             page = folder / page_name(each.number)
-            await report(reading, each, page, force=force, similar=similar, back=back)
+            await report(reading, each, page, force=force, similar=similar, back=back, images=images)
         except (errors.LogDamaged, errors.DatabaseForeign) as error:
             unreadable[each.number] = str(error)
         except (errors.PycrormError, OSError):

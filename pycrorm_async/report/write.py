@@ -35,6 +35,7 @@ from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, cue_like
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.output_files import refuse_existing, write_file
+from pycrorm_async.report.pictures import Images
 from pycrorm_async.visible_text import visible
 
 
@@ -62,6 +63,7 @@ async def report(
     last: int | None = None,
     similar: SimilarCases | None = None,
     back: str = "",
+    images: Images = "thumbs",
 ) -> Report:
     """Write an episode as one HTML file that opens offline, and return the file and the events that it shows.
 
@@ -74,6 +76,8 @@ async def report(
             or 200,000 moves.
         similar: the cases of the memory, which an overview reads once for all its pages.
         back: address of the overview, to which the page links.
+        images: what the page has of observed images, depth maps and point clouds: `none`; thumbnails of at most 200,
+            `thumbs`; or `full`, the whole contents, up to 24 MB, and thumbnails of the others.
 
     Raises `UnknownEpisode`; `CallerError` if the file exists or cannot have this name, or if no event is in the window;
     `LogDamaged` or `DatabaseForeign` for an event that cannot be read; `OSError` if the disk is full.
@@ -81,7 +85,7 @@ async def report(
     if path is not None:
         refuse_existing(Path(path), force=force)
     name = str(episode.number if isinstance(episode, EpisodeSummary) else episode)
-    document = await episode_document(reading, name, first=first, last=last)
+    document = await episode_document(reading, name, first=first, last=last, images=images)
     document["outcomes"] = await outcomes_of(reading, document["episode"]["number"])
     similar = similar or SimilarCases(reading)
     document["similar"] = await similar.document(document["episode"]["number"], document["nodes"][0])
@@ -103,8 +107,8 @@ async def report(
 # server for the parts of the document that follow.
 
 _EPISODE = (
-    "dom episode bodies extent path_lines scene_camera scene_view map_view tree_view gantt_bars gantt_view"
-    " similar panels playback main"
+    "dom episode find bodies extent path_lines scene_camera seen_view scene_view map_view tree_view gantt_bars"
+    " gantt_view similar panels playback main"
 ).split()
 """The modules of the page's program, every one behind those that it imports."""
 _STREAM = ("stream",)

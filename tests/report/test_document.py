@@ -101,10 +101,18 @@ async def test_a_document_has_every_node_object_observation_and_time(url: str) -
     assert len(document["times"]) == document["episode"]["head"]
 
 
-async def test_an_object_without_a_description_is_a_point_and_the_page_names_the_reason(url: str) -> None:
+async def test_a_robot_without_a_description_is_a_body_of_human_scale_and_another_object_a_point(url: str) -> None:
+    with Memory.sync(url) as memory:
+        with memory.recording.episode() as episode:
+            record(memory, episode)
+            episode.object_added("lamp", "lamp", "LAMP", Pose([0, 0, 0]))
+        memory.flush()
     document = await document_of(url)
-    model = document["models"][document["objects"][0]["model"]]
-    assert model["assumed"] == "a point, because its description was not recorded"
+    robot, lamp = (document["models"][each["model"]] for each in document["objects"])
+    assert robot["assumed"] == "a body with its heading, because its description was not recorded"
+    tops = [xyz[2] + (sizes[2] / 2 if kind == "box" else 0) for kind, sizes, xyz, *_ in robot["shapes"][""]]
+    assert 1.5 < max(tops) < 1.9
+    assert lamp["assumed"] == "a point, because its description was not recorded"
 
 
 async def test_a_message_of_a_mebibyte_is_cut_and_its_length_is_in_the_page(url: str) -> None:
@@ -258,7 +266,7 @@ async def test_an_object_without_a_description_that_a_built_in_one_fits_has_its_
     one, two = (document["models"][each["model"]] for each in document["objects"])
     assert one["assumed"] == "the built-in shape, because its description was not recorded"
     assert len(one["shapes"]) > 10
-    assert two["assumed"].startswith("a point")
+    assert two["assumed"].startswith("a body with its heading")
 
 
 # === bundle ===================================================================================================

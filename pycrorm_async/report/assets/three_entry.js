@@ -16,6 +16,8 @@ export {
   MeshStandardMaterial,
   PerspectiveCamera,
   PlaneGeometry,
+  Points,
+  PointsMaterial,
   Raycaster,
   Scene,
   ShadowMaterial,

@@ -143,6 +143,12 @@ export function namedOf(present, chosen) {
   return named.sort((one, other) => rankOf(one) - rankOf(other)).slice(0, NAMES_MAX);
 }
 
+/** The name of an object, and which arm holds it. */
+export function heldName(object, held) {
+  const holder = held.find((each) => each.object === object);
+  return holder === undefined || !holder.by ? object.name : `${object.name} in the ${holder.by}`;
+}
+
 const COLORS = ["--path-1", "--path-2", "--path-3", "--path-4"];
 const DASHES = [null, [3, 2], [1, 1.5], [7, 2]];
 

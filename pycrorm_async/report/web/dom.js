@@ -65,4 +65,7 @@ export function backTo(overview) {
   return settings ? `${overview}#${settings}` : overview;
 }
 
+/** The colours for robots and types; further ones have those of the first again. */
+export const HUES = 6;
+
 export const colorOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

@@ -67,6 +67,7 @@ export function extremes(values, pointsMax) {
 }
 
 const CURVE_POINTS_MAX = 2000;
+const PICTURES_MAX = 400; // of one camera, whose contents a live page keeps
 
 function extendTracks(tracks, columns, pointsMax) {
   for (const [name, each] of Object.entries(columns)) {
@@ -80,9 +81,9 @@ const LISTS = ["detections", "observations", "locations"];
 
 export class Episode {
   constructor(document) {
-    Object.assign(this, { times: [], texts: [], models: {}, nodes: [], roots: [], rootFailures: [], objects: [] });
+    Object.assign(this, { times: [], texts: [], models: {}, nodes: [], roots: [], robots: [], rootFailures: [], objects: [] });
     Object.assign(this, { attachments: [], detections: [], observations: [], locations: [] });
-    Object.assign(this, { series: new Map(), samples: new Map(), nodeAt: new Map(), objectById: new Map() });
+    Object.assign(this, { series: new Map(), samples: new Map(), cameras: new Map(), unpictured: 0, nodeAt: new Map(), objectById: new Map() });
     this.extend(document);
   }
 
@@ -97,6 +98,7 @@ export class Episode {
     for (const each of part.objects) this.#extendObject(each);
     this.#extendAttachments(part.attachments);
     for (const each of LISTS) append(this[each], part[each]);
+    this.#extendPictures(part);
     extendTracks(this.series, part.series, CURVE_POINTS_MAX);
     for (const [id, tracks] of Object.entries(part.samples)) {
       if (!this.samples.has(Number(id))) this.samples.set(Number(id), new Map());
@@ -105,20 +107,22 @@ export class Episode {
   }
 
   #extendNodes({ nodes: columns, ended }) {
-    const [starts, ends, parents, kinds, types, parameters, statuses, reasons, messages] = columns;
+    const [starts, ends, parents, kinds, types, parameters, statuses, reasons, messages, robots, wholes, results] = columns;
     const { texts } = this;
     starts.forEach((start, index) => {
       const node = new Node(this, start, this.nodeAt.get(parents[index]) ?? null, texts[kinds[index]], texts[types[index]]);
       node.parameters = texts[parameters[index]];
-      node.became(ends[index], texts[statuses[index]], texts[reasons[index]], texts[messages[index]]);
+      Object.assign(node, { robot: texts[robots[index]], whole: texts[wholes[index]] });
+      if (node.robot && !this.robots.includes(node.robot)) this.robots.push(node.robot);
+      node.became(ends[index], ...[statuses, reasons, messages, results].map((column) => texts[column[index]]));
       this.nodes.push(node);
       this.nodeAt.set(start, node);
       const siblings = node.parent?.children ?? this.roots;
       node.place = siblings.push(node);
     });
     ended[0].forEach((start, index) => {
-      const [end, status, reason, message] = ended.slice(1).map((column) => column[index]);
-      this.nodeAt.get(start)?.became(end, texts[status], texts[reason], texts[message]);
+      const [end, ...became] = ended.slice(1).map((column) => column[index]);
+      this.nodeAt.get(start)?.became(end, ...became.map((each) => texts[each]));
     });
     this.#findRootFailures();
   }
@@ -153,6 +157,17 @@ export class Episode {
     Object.assign(object, rest);
     object.poses.extend(poses);
     extendTracks(object.joints, joints);
+  }
+
+  /** Add pictures, and drop the contents of the oldest of many. */
+  #extendPictures({ pictures, contents, unpictured }) {
+    this.unpictured += unpictured;
+    for (const each of pictures) {
+      const picture = { text: "", ...each, source: each.content === undefined ? null : contents[each.content] };
+      if (!this.cameras.has(each.camera)) this.cameras.set(each.camera, []);
+      this.cameras.get(each.camera).push(picture);
+    }
+    for (const each of this.cameras.values()) for (const old of each.slice(0, -PICTURES_MAX)) old.source = null;
   }
 
   /** Add attachments, and replace those that ended; an attachment begins with an event of its own. */
@@ -213,9 +228,23 @@ export class Episode {
     return { revolute: "rad", continuous: "rad", prismatic: "m" }[type] ?? "";
   }
 
+  /** The objects that robots hold after an event, and with what: `{ robot, object, by }`. */
+  heldAt(event) {
+    return this.attachedAt(event).flatMap(([parent, child, link]) => {
+      const [robot, object] = [this.objectById.get(parent), this.objectById.get(child)];
+      return robot?.type === "ROBOT" && object ? [{ robot, object, by: armOf(link) }] : [];
+    });
+  }
+
   nameOf(id) {
     return this.objectById.get(id)?.name ?? `object ${id}`;
   }
+}
+
+/** The arm to which a link belongs, as far as its name says so; else the link. */
+export function armOf(link) {
+  if (/(^|[_\-/ ])(l|left)([_\-/ ]|$)/i.test(link)) return "left arm";
+  return /(^|[_\-/ ])(r|right)([_\-/ ]|$)/i.test(link) ? "right arm" : link;
 }
 
 export class Node {
@@ -228,8 +257,14 @@ export class Node {
     this.name = type || kind;
   }
 
-  became(end, status, reason, message) {
-    Object.assign(this, { end, status, reason, message });
+  became(end, status, reason, message, result) {
+    Object.assign(this, { end, status, reason, message, result });
+  }
+
+  /** Parameters as pairs of name and value, as far as the page has them. */
+  get pairs() {
+    const lines = this.whole ? this.whole.split("\n") : this.parameters.split(/ (?=[\w.-]+=)/);
+    return lines.filter(Boolean).map((line) => [line.split("=", 1)[0], line.slice(line.indexOf("=") + 1)]);
   }
 
   judge(outcome) {
@@ -258,6 +293,25 @@ export function outcomesText(failures) {
   return [...counts].sort(([, one], [, other]) => other - one).map(([outcome, count]) => `${count} ${outcome}`).join(", ");
 }
 
+/** What differs among nodes that failed alike: the names, and for each node its values; of the node and of the action around it. */
+export function differencesOf(nodes) {
+  const rows = nodes.map((node) => {
+    let action = node;
+    while (action !== null && action.kind !== "action") action = action.parent;
+    const around = action === null || action === node ? [] : action.pairs.map(([name, value]) => [`${action.name} ${name}`, value]);
+    const counted = [...node.message.slice(0, 500).matchAll(NUMBER)].map((each, index) => {
+      const before = each.input.slice(0, each.index).match(/[^\s(),;:=\d.-]+(?=[^\w]*$)/)?.[0]; // the word before a number names it
+      return [`${before ?? "number"} … ${index > 0 ? index + 1 : ""}`.trimEnd(), each[0]];
+    });
+    return new Map([["robot", node.robot], ...around, ...node.pairs, ...counted]);
+  });
+  const names = [...new Set(rows.flatMap((each) => [...each.keys()]))];
+  const differing = names.filter((name) => new Set(rows.map((each) => each.get(name) ?? "")).size > 1);
+  return { names: differing, rows: rows.map((each) => differing.map((name) => each.get(name) ?? "")) };
+}
+
+const NUMBER = /-?\d+(\.\d+)?(e-?\d+)?/g;
+
 /** Failures by reason, the most frequent first, and in each the messages that differ in more than their numbers. */
 export function failureGroups(failures) {
   const groups = new Map();
@@ -266,7 +320,7 @@ export function failureGroups(failures) {
     if (!groups.has(reason)) groups.set(reason, { reason, failures: [], messages: new Map() });
     const { failures: all, messages } = groups.get(reason);
     all.push(each);
-    const pattern = each.message.slice(0, 500).replace(/-?\d+(\.\d+)?(e-?\d+)?/g, "…");
+    const pattern = each.message.slice(0, 500).replace(NUMBER, "…");
     if (!messages.has(pattern)) messages.set(pattern, []);
     messages.get(pattern).push(each);
   }

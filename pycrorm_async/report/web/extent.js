@@ -1,6 +1,7 @@
 // Finds what must be in the picture: at one moment, and of a whole episode; never for the sake of what is far from all else.
 
 const SURROUNDINGS_M = 2.5; // of a large environment, as much is framed around the objects in it
+const ACTION_M = 3; // what lies farther from all that moves, and never moves itself, is left out
 const FAR_M = 10;
 const FAR_TIMES = 6;
 const SAMPLES_MAX = 4000;
@@ -18,7 +19,10 @@ export function pointsOfMoment(bodies, paths) {
 
 /** The points to look at, to see the bodies of an episode wherever they come; leaves the bodies at other moments. */
 export function pointsOfEpisode(episode, bodies) {
-  const objects = episode.objects.filter((each) => each.type !== "ENVIRONMENT");
+  const all = episode.objects.filter((each) => each.type !== "ENVIRONMENT");
+  const acting = all.filter((each) => each.type === "ROBOT" || each.poses.values.length > 1).flatMap(({ poses }) => sampleOf(poses.values, 100));
+  const isPartOf = ({ poses }) => poses.values.length > 1 || acting.some((each) => Math.hypot(each[0] - poses.values[0][0], each[1] - poses.values[0][1]) < ACTION_M);
+  const objects = acting.length > 0 ? all.filter(isPartOf) : all;
   const isNear = nearTo(objects.flatMap(({ poses }) => sampleOf(poses.values)));
   const points = objects.flatMap((object) => {
     const body = bodies.of(object);
@@ -68,8 +72,8 @@ function nearTo(positions, around = positions) {
   return (each) => distance(each) <= far;
 }
 
-const sampleOf = (values) => {
-  const step = Math.ceil(values.length / SAMPLES_MAX);
+const sampleOf = (values, most = SAMPLES_MAX) => {
+  const step = Math.ceil(values.length / most);
   return step <= 1 ? values : values.filter((_, index) => index % step === 0);
 };
 

@@ -15,10 +15,13 @@ const PALE = 0.35;
 
 const BAR_COLORS = { SUCCEEDED: "good", FAILED: "bad", ERROR: "bad", RUNNING: "run" };
 const GROUPS = ["bad", "odd", "run", "good"];
-const colorOfNode = (node) => BAR_COLORS[node.status] ?? "odd";
+const groupOf = (node) => BAR_COLORS[node.status] ?? "odd";
 
-/** Draws the nodes of one lane; `span` gives the left and the right end of a node in pixels, `event` is the moment. */
-export function drawLane(pen, nodes, y, { left, right, span, event, selected, colors }) {
+/**
+ * Draws the nodes of one lane; `span` gives the left and the right end of a node in pixels, `event` is the moment, and
+ * `hueOf` a colour that takes the place of that of a node's status, or undefined.
+ */
+export function drawLane(pen, nodes, y, { left, right, span, event, selected, hueOf, colors }) {
   const bins = new Map();
   for (const node of nodes) {
     const [from, to] = span(node);
@@ -26,6 +29,7 @@ export function drawLane(pen, nodes, y, { left, right, span, event, selected, co
     if (from > right) break;
     const ends = [Math.max(from, left), Math.min(to, right)].map(Math.round); // whole pixels, so that no line blurs
     const bar = { node, y: y + 1, left: ends[0], right: ends[1], later: node.start > event };
+    bar.color = hueOf(node) ?? colors[groupOf(node)];
     if (to - from >= NARROW_PX) {
       drawBar(pen, bar, node === selected, colors);
       continue;
@@ -40,15 +44,14 @@ export function drawLane(pen, nodes, y, { left, right, span, event, selected, co
   }
 }
 
-function drawBar(pen, { node, y, left, right, later }, selected, colors) {
+function drawBar(pen, { node, y, left, right, later, color }, selected, colors) {
   const wide = right - left - 1;
-  const color = colors[colorOfNode(node)];
   pen.globalAlpha = later ? PALE : 1;
   pen.fillStyle = color;
   pen.fillRect(left, y, wide, BAR_PX);
   pen.strokeStyle = colors["on-bar"];
   if (node.failed) hatch(pen, left, y, wide, 1);
-  else if (colorOfNode(node) === "odd") hatch(pen, left, y, wide, 0);
+  else if (groupOf(node) === "odd") hatch(pen, left, y, wide, 0);
   if (node.end === 0) openEnd(pen, left, y, wide, colors);
   pen.globalAlpha = 1;
   if (selected) {
@@ -110,11 +113,11 @@ function openEnd(pen, x, y, width, colors) {
 }
 
 /** A bar without room: a failure is underlined, and what did not come to its own end is broken in the middle. */
-function drawNarrow(pen, { node, y, left, right, later }, colors) {
+function drawNarrow(pen, { node, y, left, right, later, color }, colors) {
   const wide = Math.max(right - left - 1, 1);
-  const group = colorOfNode(node);
+  const group = groupOf(node);
   pen.globalAlpha = later ? PALE : 1;
-  pen.fillStyle = colors[group];
+  pen.fillStyle = color;
   pen.fillRect(left, y, wide, BAR_PX);
   pen.fillStyle = colors.paper;
   if (group === "odd" || group === "run") pen.fillRect(left, y + BAR_PX / 2 - 2, wide, 4);
@@ -127,7 +130,7 @@ function drawNarrow(pen, { node, y, left, right, later }, colors) {
 function drawBin(pen, bars, x, wide, colors) {
   const counts = new Map();
   for (const { node } of bars) {
-    const group = node.failed ? "bad" : colorOfNode(node);
+    const group = node.failed ? "bad" : groupOf(node);
     counts.set(group, (counts.get(group) ?? 0) + 1);
   }
   const groups = GROUPS.filter((each) => counts.has(each));
@@ -137,7 +140,7 @@ function drawBin(pen, bars, x, wide, colors) {
   groups.forEach((group, index) => {
     const last = index === groups.length - 1;
     const high = last ? foot - y : Math.min(Math.max(4, Math.round((counts.get(group) / bars.length) * BAR_PX)), foot - y - 3);
-    pen.fillStyle = colors[group];
+    pen.fillStyle = bars.find(({ node }) => !node.failed && groupOf(node) === group)?.color ?? colors[group];
     pen.fillRect(x, foot - high, wide, high - (index > 0 ? 1 : 0));
     pen.fillStyle = colors.paper;
     if (group !== "good") for (let at = foot - high + 1; at < foot; at += 3) pen.fillRect(x, at, wide, 1);

@@ -1,22 +1,31 @@
 // Shows every node as a bar over events or over time: which moment and which part of the episode is drawn, and the axis.
 
-import { colorOf, duration, element, plain } from "./dom.js";
+import { colorOf, duration, element, HUES, plain } from "./dom.js";
 import { drawLane, LANE_PX, roundTicks } from "./gantt_bars.js";
 
-const AXIS_PX = 20;
+const AXIS_PX = 26;
+const TEXT_PX = 11; // the middle of the labels; below them is what part of the whole is drawn
 const TICK_PX = 90;
 const PAD_PX = 8;
+const HEADING_PX = 17;
+const STEP = 0.2; // of what is drawn, by one key
 
 export class GanttView {
-  constructor(holder, episode, { onSeek, onSelect }) {
+  /** `onDraw` is called when other events have other places. */
+  constructor(holder, episode, { onSeek, onSelect, onDraw }) {
     this.holder = holder;
+    this.onDraw = onDraw;
     this.episode = episode;
     this.canvas = document.createElement("canvas");
-    this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label", "Gantt chart of the nodes");
+    const keys = "W and S zoom, A and D move, 0 shows all";
+    for (const [name, value] of Object.entries({ role: "application", tabindex: 0, "aria-label": `Gantt chart of the nodes: ${keys}` })) {
+      this.canvas.setAttribute(name, value);
+    }
+    this.canvas.addEventListener("keydown", (pressed) => this.#press(pressed));
     this.axis = element("canvas", { class: "axis", "aria-hidden": "true" });
     holder.append(this.canvas, this.axis);
     this.byTime = false;
+    this.colors = "status";
     this.lanes = new Lanes();
     this.lanes.extend(episode.nodes);
     this.window = this.extent = this.#all();
@@ -46,6 +55,26 @@ export class GanttView {
     this.#showWindow(this.extent);
   }
 
+  /** Colour the bars by `status`, `robot` or `type`. */
+  setColors(colors) {
+    this.colors = colors;
+    this.draw();
+  }
+
+  /** The names that have colours of their own, with the numbers of these; none by status. */
+  get hues() {
+    const { robots, nodes } = this.episode;
+    if (this.colors === "status") return [];
+    if (this.colors === "robot") return robots.map((each, index) => [each, index % HUES]);
+    if (this.counted !== nodes.length) {
+      const counts = new Map();
+      for (const { name, kind } of nodes) if (kind !== "root") counts.set(name, (counts.get(name) ?? 0) + 1);
+      this.types = [...counts].sort(([, one], [, other]) => other - one).slice(0, HUES).map(([name], index) => [name, index]);
+      this.counted = nodes.length;
+    }
+    return this.types;
+  }
+
   /** Take in the nodes that the episode has by now; `show` draws them. */
   grow() {
     const whole = this.window.every((each, index) => each === this.extent[index]);
@@ -73,19 +102,52 @@ export class GanttView {
     if (!turned.ctrlKey && !turned.shiftKey && Math.abs(turned.deltaY) <= Math.abs(turned.deltaX)) return;
     turned.preventDefault();
     const [from, to] = this.window;
-    const [low, high] = this.#all();
     const here = from + ((turned.offsetX - PAD_PX) / this.width) * (to - from);
-    const factor = turned.deltaY > 0 ? 1.25 : 0.8;
+    this.#zoomAt(here, turned.deltaY > 0 ? 1.25 : 0.8);
+  }
+
+  /** Draw a larger or a smaller part around a position. */
+  #zoomAt(here, factor) {
+    const [from, to] = this.window;
+    const [low, high] = this.#all();
     const narrowest = this.byTime ? 1e-5 : 4;
     if ((to - from) * factor < narrowest) return;
     this.#showWindow([Math.max(low, here - (here - from) * factor), Math.min(high, here + (to - here) * factor)]);
+  }
+
+  /** Draw a part before or after the present one, of the same size. */
+  #move(share) {
+    const [from, to] = this.window;
+    const [low, high] = this.#all();
+    const by = Math.min(Math.max((to - from) * share, low - from), high - to);
+    this.#showWindow([from + by, to + by]);
+  }
+
+  #press(pressed) {
+    if (pressed.ctrlKey || pressed.metaKey || pressed.altKey) return;
+    const [from, to] = this.window;
+    const cursor = this.#position(this.event);
+    const middle = from <= cursor && cursor <= to ? cursor : (from + to) / 2;
+    const actions = {
+      w: () => this.#zoomAt(middle, 0.7),
+      s: () => this.#zoomAt(middle, 1 / 0.7),
+      a: () => this.#move(-STEP),
+      d: () => this.#move(STEP),
+      0: () => this.#showWindow(this.#all()),
+    };
+    const action = actions[pressed.key.toLowerCase()];
+    if (action === undefined) return;
+    action();
+    pressed.preventDefault();
+    pressed.stopPropagation();
   }
 
   #position(event) {
     return this.byTime ? this.episode.secondsAt(event) : event;
   }
 
-  #xOf(event) {
+  /** The place of an event, in pixels from the left edge. */
+  xOf(event) {
     const [from, to] = this.window;
     return PAD_PX + ((this.#position(event) - from) / (to - from)) * this.width;
   }
@@ -97,9 +159,10 @@ export class GanttView {
   }
 
   #nodeAt(x, y) {
-    const lane = Math.floor(y / LANE_PX);
-    for (const node of this.lanes.nodes[lane] ?? []) {
-      if (this.#xOf(node.start) - 1 <= x && x <= this.#xOf(node.lastEvent) + 1) return node;
+    const lane = this.lanes.drawn.findLast((each) => each.y <= y);
+    if (lane === undefined || y > lane.y + LANE_PX) return null;
+    for (const node of lane.nodes) {
+      if (this.xOf(node.start) - 1 <= x && x <= this.xOf(node.lastEvent) + 1) return node;
     }
     return null;
   }
@@ -110,22 +173,30 @@ export class GanttView {
     this.width = width - 2 * PAD_PX;
     const names = ["good", "bad", "odd", "run", "ink", "quiet", "paper", "on-bar"];
     const colors = Object.fromEntries(names.map((each) => [each, colorOf(`--${each}`)]));
-    const height = this.lanes.nodes.length * LANE_PX;
+    const { drawn, height } = this.lanes;
     const pen = penOf(this.canvas, width, height);
-    const span = (node) => [this.#xOf(node.start), this.#xOf(node.lastEvent)];
+    const span = (node) => [this.xOf(node.start), this.xOf(node.lastEvent)];
     const ends = { left: PAD_PX, right: PAD_PX + this.width };
     const moment = { event: this.event ?? Infinity, selected: this.selected };
-    this.lanes.nodes.forEach((nodes, lane) => drawLane(pen, nodes, lane * LANE_PX, { ...ends, ...moment, span, colors }));
+    const hues = new Map(this.hues.map(([name, number]) => [name, colorOf(`--hue-${number}`)]));
+    const hueOf = (node) => hues.get(this.colors === "robot" ? node.robot : node.name);
+    for (const { nodes, y, robot } of drawn) {
+      if (robot !== undefined) drawHeading(pen, robot, y, colors);
+      drawLane(pen, nodes, y, { ...ends, ...moment, span, hueOf, colors });
+    }
     this.#drawCursor(pen, height, colors);
     const axis = penOf(this.axis, width, AXIS_PX);
     this.#drawAxis(axis, colors);
     this.#drawCursor(axis, 4, colors);
+    const places = [...this.window, width, this.episode.last, this.byTime].join();
+    if (places !== this.places) this.onDraw();
+    this.places = places;
   }
 
   #drawCursor(pen, height, colors) {
     if (this.event === undefined) return;
     pen.fillStyle = colors.ink;
-    pen.fillRect(this.#xOf(this.event) - 1, 0, 2, height);
+    pen.fillRect(this.xOf(this.event) - 1, 0, 2, height);
   }
 
   /** The labels of the axis and their left ends in pixels: all different, and none over another; the ends come first. */
@@ -147,8 +218,24 @@ export class GanttView {
 
   #drawAxis(pen, colors) {
     pen.fillStyle = colors.quiet;
-    for (const { text, left } of this.ticks()) pen.fillText(text, left, AXIS_PX / 2 + 2);
+    for (const { text, left } of this.ticks()) pen.fillText(text, left, TEXT_PX);
+    const [low, high] = this.#all();
+    const [from, to] = this.window;
+    if (from === low && to === high) return;
+    const xOf = (position) => PAD_PX + ((position - low) / (high - low)) * this.width;
+    pen.globalAlpha = 0.3;
+    pen.fillRect(PAD_PX, AXIS_PX - 5, this.width, 3);
+    pen.globalAlpha = 1;
+    pen.fillRect(xOf(from), AXIS_PX - 6, Math.max(xOf(to) - xOf(from), 3), 5);
+    pen.fillStyle = colors.bad;
+    for (const { lastEvent } of this.episode.rootFailures.slice(0, this.width)) pen.fillRect(xOf(this.#position(lastEvent)) - 1, AXIS_PX - 6, 2, 5);
   }
+}
+
+function drawHeading(pen, robot, y, colors) {
+  pen.globalAlpha = 1;
+  pen.fillStyle = colors.quiet;
+  pen.fillText(plain(robot), PAD_PX, y - HEADING_PX / 2 + 1);
 }
 
 /** A pen for a canvas of a size in pixels of the page. */
@@ -163,22 +250,42 @@ function penOf(canvas, width, height) {
   return pen;
 }
 
-/** Gives each node the first free lane below its parent's, so that concurrent branches do not cover each other. */
+/**
+ * Gives each node the first free lane below its parent's, so that concurrent branches do not cover each other. Where
+ * several robots act, each has lanes of its own, below a heading.
+ */
 class Lanes {
   constructor() {
-    this.nodes = [];
     this.of = new Map();
+    this.lanes = new Map();
   }
 
   /** Give lanes to the nodes that have none yet, of all nodes in the order in which they started. */
   extend(nodes) {
     for (let index = this.of.size; index < nodes.length; index++) {
       const node = nodes[index];
-      let lane = node.parent === null ? 0 : this.of.get(node.parent) + 1;
-      while ((this.nodes[lane]?.at(-1)?.lastEvent ?? 0) > node.start) lane++;
-      while (this.nodes.length <= lane) this.nodes.push([]);
+      if (!this.lanes.has(node.robot)) this.lanes.set(node.robot, []);
+      const lanes = this.lanes.get(node.robot);
+      let lane = node.parent?.robot === node.robot ? this.of.get(node.parent) + 1 : 0;
+      while ((lanes[lane]?.at(-1)?.lastEvent ?? 0) > node.start) lane++;
+      while (lanes.length <= lane) lanes.push([]);
       this.of.set(node, lane);
-      this.nodes[lane].push(node);
+      lanes[lane].push(node);
+    }
+    this.#place();
+  }
+
+  #place() {
+    const several = [...this.lanes.keys()].filter(Boolean).length > 1;
+    this.drawn = [];
+    this.height = 0;
+    for (const [robot, lanes] of this.lanes) {
+      lanes.forEach((nodes, index) => {
+        const isHeaded = several && index === 0 && robot !== "";
+        if (isHeaded) this.height += HEADING_PX;
+        this.drawn.push({ nodes, y: this.height, robot: isHeaded ? robot : undefined });
+        this.height += LANE_PX;
+      });
     }
   }
 }

@@ -3,19 +3,24 @@
 import { Bodies, pathsOf } from "./bodies.js";
 import { backTo, duration, element, recorded, strokeOf, svg } from "./dom.js";
 import { Episode, signOf } from "./episode.js";
+import { Find, testOf } from "./find.js";
 import { GanttView } from "./gantt_view.js";
 import { MapView } from "./map_view.js";
 import { Panels } from "./panels.js";
 import { Playback } from "./playback.js";
 import { SceneView } from "./scene_view.js";
+import { SeenView } from "./seen_view.js";
 import { TreeView } from "./tree_view.js";
 
 const NOTES_MAX = 3;
 const NAMED_MAX = 2;
+const ROBOTS_MAX = 4;
+const HELD_MAX = 4;
 const HELP = [
   "Space plays, in proportion to time if the axis of the chart is time. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
   "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows all of the moment and its paths, R follows the robot.",
-  "Chart: the wheel zooms, a double click shows all.",
+  "Chart: the wheel zooms, a double click shows all; while the chart has the focus, W and S zoom, A and D move, 0 shows all.",
+  "Tree: / finds nodes by words, or by type:PickUp object:milk robot:pr2 status:failed reason:IK text:grasp; Enter goes to the next one. The address of the page keeps the moment, the node and what was searched.",
   "Words: an episode is one recorded run of a plan. A node is one performed step of it, such as an action or a motion. An event is one fact that was stored when it happened, e12 the twelfth of the episode. A snapshot is the state of nodes, objects and robots at one moment.",
 ];
 const part = (name) => document.getElementById(name);
@@ -23,8 +28,9 @@ const part = (name) => document.getElementById(name);
 class Page {
   constructor(episode, similar) {
     this.episode = episode;
-    this.event = this.#eventInAddress() ?? episode.opens;
+    this.event = episode.opens;
     this.selected = null;
+    this.query = "";
     this.object = null;
     this.playback = new Playback({ onEvent: (event) => this.#moveTo(event), onEnd: () => this.#namePlay() });
     this.following = false;
@@ -34,21 +40,58 @@ class Page {
     this.map = new MapView(part("map"), episode, this.bodies);
     this.view = this.#sceneOrMap();
     this.tree = new TreeView(part("tree"), episode, { onSelect: select });
-    this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select });
+    this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select, onDraw: () => this.seen?.drawStrip() });
+    const holders = { strip: part("strip"), inset: part("seen"), dialog: part("picture") };
+    this.seen = new SeenView(holders, episode, { xOf: (event) => this.gantt.xOf(event), onSeek: seek });
     const choose = (object) => this.choose(object);
     this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select, onChoose: choose, similar });
+    this.find = new Find(part("find"), {
+      onQuery: (query) => this.search(query),
+      onStep: (step) => this.#nextMatch(step),
+      onLeave: () => part("tree").focus(),
+    });
     this.#head();
     this.#controls();
     this.#listen();
     const events = Math.max(episode.last - episode.first, 1);
     if (episode.secondsAt(episode.last) / events > 0.05) this.#changeAxis();
-    this.show();
+    if (!this.#goToAddress()) this.show();
   }
 
-  #eventInAddress() {
-    const match = /^#e(\d+)$/.exec(location.hash);
-    if (match === null) return null;
-    return Math.min(Math.max(Number(match[1]), this.episode.first), this.episode.last);
+  /** Show the node, the moment and the search that the address names; return whether it names one of the first two. */
+  #goToAddress() {
+    const { episode } = this;
+    const parts = location.hash.slice(1).split("&");
+    const number = (sign) => Number(parts.find((each) => RegExp(`^${sign}\\d+$`).test(each))?.slice(1) ?? NaN);
+    const [event, node] = [number("e"), episode.nodeAt.get(number("n"))];
+    const query = decoded(parts.find((each) => each.startsWith("q="))?.slice(2) ?? "");
+    if (query !== this.query) this.search(query);
+    if (Number.isNaN(event) && node === undefined) return false;
+    if (node !== undefined && node !== this.selected) this.select(node);
+    if (!Number.isNaN(event) && event !== this.event) this.#moveTo(event, this.selected === node ? node : null);
+    return true;
+  }
+
+  #address() {
+    const { event, selected, query } = this;
+    const names = [];
+    if (selected !== null) names.push(`n${selected.start}`);
+    if (selected === null ? !this.following : selected.lastEvent !== event) names.push(`e${event}`);
+    if (query) names.push(`q=${encodeURIComponent(query)}`);
+    return names.length > 0 ? `#${names.join("&")}` : location.pathname + location.search;
+  }
+
+  /** List the nodes that match a query, and the ways to them; all without one. */
+  search(query) {
+    this.query = query.trim() === "" ? "" : query;
+    const matches = this.tree.filter(this.query ? testOf(this.query) : null);
+    this.find.show(query, matches?.size ?? null);
+    this.#keepAddress();
+  }
+
+  #nextMatch(step) {
+    const next = this.tree.matchBeside(this.selected, step);
+    if (next !== undefined) this.select(next);
   }
 
   #sceneOrMap() {
@@ -77,12 +120,14 @@ class Page {
       `by ${episode.created_by}`,
       episode.simulated ? "a simulation" : null,
       episode.tags.length > 0 ? episode.tags.join(", ") : null,
+      episode.robots.length > 0 ? `robot${episode.robots.length === 1 ? "" : "s"} ${episode.robots.slice(0, ROBOTS_MAX).join(", ")}${episode.robots.length > ROBOTS_MAX ? ` and ${episode.robots.length - ROBOTS_MAX} more` : ""}` : null,
       whole ? null : `events ${episode.first} to ${episode.last} of ${episode.head}`,
     ].filter((each) => each !== null);
     const list = episode.overview ? element("a", { href: backTo(episode.overview) }, "all episodes") : "";
     part("facts").replaceChildren(list, ...facts.map((each) => recorded(each)));
     const notes = this.#assumptions().slice(0, NOTES_MAX).map((each) => element("p", {}, recorded(each)));
     document.body.classList.toggle("no-objects", episode.objects.length === 0);
+    document.body.classList.toggle("has-pictures", episode.cameras.size > 0);
     if (episode.objects.length === 0) notes.push(element("p", {}, "This episode recorded no objects: there is no scene to draw."));
     part("notes").replaceChildren(...notes);
   }
@@ -112,12 +157,27 @@ class Page {
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     this.clock = element("output", { class: "clock" });
     this.axis = element("button", { type: "button", class: "axis", title: "axis of the chart: events, which are equally far apart, or time (A)", onclick: () => this.#changeAxis() }, "by event");
+    this.colors = element("select", { "aria-label": "colours of the chart", title: "colours of the chart", onchange: () => this.#color() });
+    this.colors.append(...["status", "robot", "type"].map((each) => element("option", { value: each }, `by ${each}`)));
     const help = element("button", { type: "button", class: "help", title: "keys, mouse and words (?)", "aria-label": "keys, mouse and words", onclick: () => this.#help() }, "?");
-    part("controls").append(this.play, this.slider, this.clock, this.axis, help);
+    part("controls").append(this.play, this.slider, this.clock, this.axis, this.colors, help);
     const whole = element("button", { type: "button", title: "show all that is there at this moment, and its paths (W)", onclick: () => this.#showWhole() }, "whole scene");
     this.tracking = element("button", { type: "button", title: "keep the robot, or the chosen object, in sight (R)", onclick: () => this.#track() });
-    part("views").append(whole, this.tracking);
+    const pictures = element("button", { type: "button", class: "pictures", title: "show what was seen at this moment", "aria-pressed": "true", onclick: () => this.#showPictures(pictures) }, "pictures");
+    part("views").append(pictures, whole, this.tracking);
     this.#nameTracked();
+  }
+
+  #showPictures(button) {
+    const hidden = document.body.classList.toggle("pictures-hidden");
+    button.setAttribute("aria-pressed", String(!hidden));
+  }
+
+  /** Colour the chart as chosen, and name its colours. */
+  #color() {
+    this.gantt.setColors(this.colors.value);
+    const hues = this.gantt.hues.map(([name, number]) => element("span", { class: `robot hue-${number}` }, recorded(name)));
+    part("hues").replaceChildren(...hues);
   }
 
   #help() {
@@ -167,8 +227,8 @@ class Page {
 
   #listen() {
     addEventListener("hashchange", () => {
-      const event = this.#eventInAddress();
-      if (event !== null && event !== this.event) this.seek(event);
+      if (this.playback.running) this.togglePlay();
+      this.#goToAddress();
     });
     addEventListener("keydown", (pressed) => this.#press(pressed));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#paint());
@@ -192,13 +252,20 @@ class Page {
       a: () => this.#changeAxis(),
       r: () => this.#track(),
       w: () => this.#showWhole(),
-      Escape: () => this.choose(null),
+      Escape: () => this.#leave(),
+      "/": () => this.find.focus(),
       "?": () => this.#help(),
     };
     const action = actions[pressed.key.length === 1 ? pressed.key.toLowerCase() : pressed.key];
     if (action === undefined) return;
     pressed.preventDefault();
     action();
+  }
+
+  /** Show all nodes again, or no object. */
+  #leave() {
+    if (this.query) this.search("");
+    else this.choose(null);
   }
 
   #nextFailure() {
@@ -212,6 +279,9 @@ class Page {
     const { episode } = this;
     for (const each of parts) episode.extend(each);
     for (const each of [this.view, this.tree, this.gantt, this.panels]) each.grow();
+    if (this.query) this.find.show(this.find.field.value, this.tree.found.matches.size);
+    this.#color();
+    this.seen.drawStrip();
     this.slider.max = episode.last;
     this.#head();
     if (this.following) this.event = episode.opens;
@@ -234,11 +304,11 @@ class Page {
     else this.togglePlay();
   }
 
-  #moveTo(event) {
+  #moveTo(event, selected = null) {
     if (this.following) this.follow(false);
     const { first, last } = this.episode;
     this.event = Math.min(Math.max(Math.round(event), first), last);
-    this.selected = null;
+    this.selected = selected;
     this.show();
   }
 
@@ -287,6 +357,7 @@ class Page {
     const paths = pathsOf(episode, action);
     this.view.show(event, action, paths);
     this.#legend(paths);
+    this.seen.show(event);
     if (!this.tracked) this.#nameTracked();
     if (this.following) this.tree.follow(running);
     this.tree.show(event, running, { selected: this.selected });
@@ -296,9 +367,12 @@ class Page {
     this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}${this.playback.shortened ? " · pauses cut" : ""}`;
     this.slider.setAttribute("aria-valuetext", this.clock.textContent);
     if (matchMedia("print").matches) this.#print();
+    this.#keepAddress();
+  }
+
+  #keepAddress() {
     clearTimeout(this.writing);
-    const address = this.following ? location.pathname : `#e${this.event}`;
-    this.writing = setTimeout(() => history.replaceState(null, "", address), 250);
+    this.writing = setTimeout(() => history.replaceState(null, "", this.#address()), 250);
   }
 
   /** Name the paths in the scene, and the distance of its lines. */
@@ -307,14 +381,25 @@ class Page {
       const line = svg("line", { x1: 0, x2: 32, y1: 5, y2: 5, class: color.slice(2), "stroke-dasharray": strokeOf(dash, 2.5) });
       return element("span", {}, svg("svg", { width: 32, height: 10, "aria-hidden": "true" }, line), " path of ", recorded(object.name));
     });
+    const held = this.episode.heldAt(this.event).slice(0, HELD_MAX).map(({ robot, object, by }) =>
+      element("span", {}, recorded(robot.name), " holds ", recorded(object.name), by ? element("span", {}, " in its ", recorded(by)) : null));
     const during = ways.length > 0 ? element("span", {}, "during ", recorded(this.action.name)) : null;
-    part("legend").replaceChildren(...ways, ...(during ? [during] : []), element("span", {}, "grid 1 m"));
+    part("legend").replaceChildren(...held, ...ways, ...(during ? [during] : []), element("span", {}, "grid 1 m"));
   }
 
   #print() {
     this.map.show(this.event, this.action, pathsOf(this.episode, this.action));
     this.tree.drawForPrint();
     this.panels.drawForPrint();
+  }
+}
+
+/** The text that an address holds; the address itself if it is none that a page writes. */
+function decoded(encoded) {
+  try {
+    return decodeURIComponent(encoded);
+  } catch {
+    return encoded;
   }
 }
 

@@ -1,6 +1,6 @@
 // Draws the world after an event from above, as SVG: without WebGL, and in print.
 
-import { namedOf } from "./bodies.js";
+import { heldName, namedOf } from "./bodies.js";
 import { plain, strokeOf, svg } from "./dom.js";
 
 const SIZE_MIN_M = 2;
@@ -59,7 +59,7 @@ export class MapView {
     }
     const named = namedOf(present.map(({ body }) => body), this.chosen);
     const outlined = present.filter(({ body }) => named.includes(body));
-    for (const { x, y, size, name } of labelsOf(outlined, scale * 2.2, left, right)) {
+    for (const { x, y, size, name } of labelsOf(outlined, this.episode.heldAt(event), scale * 2.2, left, right)) {
       const label = svg("text", { x, y: -y, "font-size": size, "text-anchor": "middle" });
       label.textContent = plain(name);
       picture.append(label);
@@ -87,13 +87,13 @@ function extent(points) {
 const LETTER = 0.6; // the usual width of a letter, in heights
 
 /** Names above their bodies, inside the map, each above those that it would cover. */
-function labelsOf(bodies, size, left, right) {
+function labelsOf(bodies, held, size, left, right) {
   const placed = [];
   for (const { body, outlines } of bodies) {
     const points = outlines.flatMap(({ hull }) => hull);
     if (points.length === 0) points.push([body.group.position.x, body.group.position.y]);
     const [xs, ys] = [points.map(([x]) => x), points.map(([, y]) => y)];
-    const { name } = body.object;
+    const name = heldName(body.object, held);
     const half = Math.min((name.length * size * LETTER) / 2, (right - left) / 2);
     const middle = (Math.min(...xs) + Math.max(...xs)) / 2;
     placed.push({ name, size, half, x: Math.min(Math.max(middle, left + half), right - half), y: Math.max(...ys) + size * 0.4 });

@@ -1,12 +1,13 @@
 // Shows what belongs to a node or to the moment: details, failures by reason, percepts, observations, states.
 
-import { extremes, failureGroups, lastUpTo, outcomesText, signOf } from "./episode.js";
+import { armOf, differencesOf, extremes, failureGroups, lastUpTo, outcomesText, signOf } from "./episode.js";
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { similarTo } from "./similar.js";
 
 const LISTED_MAX = 200;
 const MESSAGES_MAX = 5;
 const LINKS_MAX = 12;
+const VALUE_MAX = 60;
 
 const listOf = (facts) => element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
 
@@ -95,7 +96,7 @@ export class Panels {
 
   /** Draw all panels below one another, for print. */
   drawForPrint() {
-    const parts = this.tabs.flatMap(([, title, , content]) => [element("h2", {}, title), ...content()]);
+    const parts = this.tabs.flatMap(([, title, , content]) => [element("h2", { class: "printed" }, title), ...content()]);
     this.body.replaceChildren(...parts);
   }
 
@@ -117,7 +118,9 @@ export class Panels {
       ["status", element("span", {}, `${signOf(node.status)} ${node.status}`)],
       ["events", element("span", {}, this.#moment(node.start), node.end ? " to " : " on", node.end ? this.#moment(node.end) : null)],
       ["took", this.#took(node)],
-      ["parameters", node.parameters ? recorded(node.parameters) : null],
+      ["robot", node.robot ? recorded(node.robot) : null],
+      ["parameters", node.parameters ? this.#parameters(node) : null],
+      ["result", node.result ? recorded(node.result, { class: "long" }) : null],
       ["reason", node.reason ? recorded(node.reason) : null],
       ["then", node.outcome],
       ["message", node.message ? recorded(node.message, { class: "long" }) : null],
@@ -136,7 +139,24 @@ export class Panels {
     });
     const whole = node.parent === null ? this.#episodeFacts() : [];
     const alike = similarTo(node, this.similar, (start) => this.#node(start));
-    return [element("h3", {}, recorded(node.name)), list, ...chosen, ...alike, ...whole];
+    const copy = element("button", { type: "button", class: "copy", onclick: () => this.#copy(node, copy) }, "copy link");
+    return [element("h2", {}, recorded(node.name), " ", copy), list, ...chosen, ...alike, ...whole];
+  }
+
+  #parameters(node) {
+    const rows = node.pairs.map(([name, value]) => element("tr", {}, element("th", { scope: "row" }, recorded(name)), element("td", {}, recorded(value, { class: "long" }))));
+    return element("table", {}, element("tbody", {}, ...rows));
+  }
+
+  /** Put the address of a node on the clipboard; a browser that does not let a page do so shows it instead. */
+  async #copy(node, button) {
+    const address = `${location.href.split("#")[0]}#n${node.start}`;
+    try {
+      await navigator.clipboard.writeText(address);
+      button.textContent = "copied";
+    } catch {
+      button.replaceWith(element("input", { class: "copy", readonly: "", value: address, "aria-label": "link to this node" }));
+    }
   }
 
   /** What was recorded about the episode as a whole. */
@@ -145,7 +165,7 @@ export class Panels {
     const recordedBy = [created_by, host].filter(Boolean).join(" on ");
     const facts = Object.entries({ id, plan, "recorded by": recordedBy, software, ...metadata });
     const shown = facts.filter(([, value]) => value).map(([name, value]) => [recorded(name), recorded(value)]);
-    return [element("h3", {}, "Episode"), listOf(shown)];
+    return [element("h2", {}, "Episode"), listOf(shown)];
   }
 
   #took({ start, end, status }) {
@@ -164,7 +184,9 @@ export class Panels {
       const shown = messages.slice(0, MESSAGES_MAX).flatMap((alike) => {
         const links = alike.slice(0, LINKS_MAX).map((each) => this.#nodeMoment(each));
         const left = alike.length > LINKS_MAX ? ` and ${alike.length - LINKS_MAX} like it` : "";
-        return [element("p", { class: "long" }, recorded(alike[0].message)), element("p", {}, ...links, left)];
+        const text = element("p", { class: "long" }, recorded(alike[0].message));
+        if (alike.length === 1) return [text, element("p", {}, ...links)];
+        return [text, this.#compared(alike.slice(0, LINKS_MAX), links), left ? element("p", {}, left) : null];
       });
       const others = messages.length - MESSAGES_MAX;
       const then = outcomesText(failures);
@@ -177,6 +199,16 @@ export class Panels {
         others > 0 ? element("p", { class: "quiet" }, `${others} other messages`) : null,
       );
     });
+  }
+
+  /** Failures that are alike, each with what differs among them. */
+  #compared(nodes, links) {
+    const { names, rows } = differencesOf(nodes);
+    if (names.length === 0) return element("p", {}, ...links, element("span", { class: "quiet" }, " no parameter differs"));
+    const cell = (value) => element("td", {}, recorded(value.length > VALUE_MAX ? `${value.slice(0, VALUE_MAX)}…` : value));
+    const heads = ["failed", ...names].map((each) => element("th", { scope: "col" }, recorded(each)));
+    const listed = rows.map((row, index) => element("tr", {}, element("td", {}, links[index]), ...row.map(cell)));
+    return element("table", { class: "compared" }, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...listed));
   }
 
   #nodeMoment(node) {
@@ -220,7 +252,7 @@ export class Panels {
     const rows = present.slice(0, LISTED_MAX).map((object) => {
       const [x, y, z, ...orientation] = object.poses.valueAt(event);
       const numbers = [x.toFixed(3), y.toFixed(3), z.toFixed(3), yawOf(orientation).toFixed(0)].map((each) => element("td", { class: "number" }, unsigned(each)));
-      const parents = attached.filter(([, child]) => child === object.id).map(([parent]) => episode.nameOf(parent));
+      const parents = attached.filter(([, child]) => child === object.id).map(([parent, , link]) => episode.nameOf(parent) + (link ? `, ${armOf(link)}` : ""));
       const chosen = object === this.chosen;
       const name = element("button", { type: "button", class: "moment", "aria-pressed": String(chosen), onclick: () => this.onChoose(chosen ? null : object) }, recorded(object.name));
       return element("tr", { class: chosen ? "lit" : null }, element("td", {}, name), element("td", {}, object.type), ...numbers, element("td", {}, recorded(parents.join(", "))));
@@ -235,7 +267,7 @@ export class Panels {
     const entries = episode.attachments.map(([parent, child, link, at, to]) => ({ parent, child, link, at, to }));
     return this.#around(entries, ({ parent, child, link, at, to }) => {
       const held = at <= this.event && (to === 0 || to > this.event);
-      const text = ` ${episode.nameOf(child)} moved with ${episode.nameOf(parent)}${link ? ` (${link})` : ""}`;
+      const text = ` ${episode.nameOf(child)} moved with ${episode.nameOf(parent)}${[armOf(link), link].filter((each, index, both) => each && both.indexOf(each) === index).map((each) => `, ${each}`).join("")}`;
       const until = to ? element("span", {}, " until ", this.#moment(to)) : " to the end";
       return element("p", { class: held ? "lit" : "" }, this.#moment(at), recorded(text), until, held ? " ◂ now" : "");
     });

@@ -3,6 +3,7 @@
 const PLAYED_S = 20;
 const EVENTS_PER_S_MIN = 4;
 const PAUSE_MAX_S = 2;
+const CALM_S = 1; // between two pictures, where less motion is preferred
 
 export class Playback {
   /** When each event is played, in seconds from the first one; `shortened` is true if a pause is shorter than its share. */
@@ -37,12 +38,21 @@ export class Playback {
     this.shortened = shortened;
     const began = performance.now() - at[from - first] * 1000;
     let index = from - first;
+    let shown = -Infinity;
+    const calm_s = matchMedia("(prefers-reduced-motion: reduce)").matches ? CALM_S : 0;
     const step = () => {
       const now = (performance.now() - began) / 1000;
+      if (now - shown < calm_s) {
+        this.waiting = requestAnimationFrame(step);
+        return;
+      }
       const before = index;
       while (index < at.length - 1 && at[index + 1] <= now) index++;
       this.waiting = requestAnimationFrame(step);
-      if (index > before) this.onEvent(first + index);
+      if (index > before) {
+        shown = now;
+        this.onEvent(first + index);
+      }
       if (this.running && index === at.length - 1) {
         this.stop();
         this.onEnd();

@@ -1,10 +1,11 @@
 // Draws the world after an event with WebGL: bodies, the paths of the current action, names; and shows what is pointed at.
 
-import { namedOf } from "./bodies.js";
+import { heldName, namedOf } from "./bodies.js";
 import { colorOf, element } from "./dom.js";
 import { pointsOfEpisode, pointsOfMoment } from "./extent.js";
 import { rodAlong } from "./path_lines.js";
 import { SceneCamera } from "./scene_camera.js";
+import { cloudsAt, pointsOf } from "./seen_view.js";
 
 const CLICK_PX = 4;
 const GRID_MAX = 200;
@@ -42,7 +43,8 @@ export class SceneView {
     this.floor.position.z = -0.004;
     this.world = new THREE.Group();
     this.paths = new THREE.Group();
-    this.scene.add(this.sun, this.sun.target, this.floor, this.world, this.paths);
+    this.clouds = new THREE.Group();
+    this.scene.add(this.clouds, this.sun, this.sun.target, this.floor, this.world, this.paths);
     this.#light(new THREE.Vector3(), 5);
     this.#listen(canvas);
     this.paint();
@@ -95,7 +97,7 @@ export class SceneView {
   paint() {
     this.scene.background = new THREE.Color(colorOf("--scene"));
     this.#drawGrid();
-    this.drawnNode = undefined;
+    this.drawnNode = this.drawnClouds = undefined;
     if (this.event !== undefined) this.show(this.event, this.node, this.pathList);
   }
 
@@ -145,6 +147,7 @@ export class SceneView {
     if (this.framed) this.#keepInSight();
     if (node !== this.drawnNode) this.#drawPaths(paths);
     this.drawnNode = node;
+    this.#drawClouds(cloudsAt(this.episode, event));
     this.renderer.shadowMap.needsUpdate = true;
     this.#render();
   }
@@ -164,6 +167,14 @@ export class SceneView {
   /** Keep an object in sight, or none. */
   follow(object) {
     this.camera.follow(object === null ? null : this.bodies.of(object));
+  }
+
+  #drawClouds(clouds) {
+    if (clouds.length === this.drawnClouds?.length && clouds.every((each, index) => each === this.drawnClouds[index])) return;
+    for (const each of this.clouds.children) each.geometry.dispose();
+    this.clouds.clear();
+    for (const each of clouds) this.clouds.add(pointsOf(each, new THREE.Color(colorOf("--path-3"))));
+    this.drawnClouds = clouds;
   }
 
   #drawPaths(paths) {
@@ -236,18 +247,19 @@ export class SceneView {
   #placeNames() {
     const { clientWidth: width, clientHeight: height } = this.holder;
     const labels = [];
+    const held = this.episode.heldAt(this.event);
     for (const { object, group } of namedOf(this.present ?? [], this.chosen)) {
       const box = new THREE.Box3().setFromObject(group);
       const top = new THREE.Vector3((box.min.x + box.max.x) / 2, (box.min.y + box.max.y) / 2, box.max.z);
       top.project(this.camera.camera);
       const middle = box.getCenter(new THREE.Vector3()).project(this.camera.camera);
       if (Math.max(Math.abs(middle.x), Math.abs(middle.y), Math.abs(middle.z)) > 1) continue;
-      const label = element("span", { class: object === this.chosen ? "chosen" : null }, element("bdi", {}, object.name));
+      const label = element("span", { class: object === this.chosen ? "chosen" : null }, element("bdi", {}, heldName(object, held)));
       labels.push({ label, x: ((top.x + 1) / 2) * width, y: ((1 - top.y) / 2) * height - 4 });
     }
     this.names.replaceChildren(...labels.map((each) => each.label));
     const around = this.holder.getBoundingClientRect();
-    const taken = [...this.holder.parentElement.querySelectorAll("#views button, #legend > *")].map((each) => each.getBoundingClientRect());
+    const taken = [...this.holder.parentElement.querySelectorAll("#views button, #legend > *, #seen figure")].map((each) => each.getBoundingClientRect());
     stack(labels, width, taken.map((each) => ({
       x: (each.left + each.right) / 2 - around.left, y: each.bottom - around.top, width: each.width + 8, height: each.height + 4,
     })));

@@ -8,7 +8,7 @@ export function similarTo(inner, similar, link) {
   let node = inner;
   while (node !== null && node.kind !== "action") node = node.parent;
   if (node === null || similar === null) return [];
-  const title = element("h3", {}, "Earlier actions most like ", node === inner ? "it" : recorded(node.name));
+  const title = element("h2", {}, "Earlier actions most like ", node === inner ? "it" : recorded(node.name));
   if (similar.fault) return [title, element("p", { class: "quiet" }, `The cases cannot be read: ${similar.fault}`)];
   const entry = similar.nodes[node.start];
   if (entry !== undefined) return [title, summaryOf(entry), ...entry.cases.map((each) => caseOf(each, similar, node.episode.number, link))];

@@ -1,7 +1,7 @@
 // Shows the task tree as a list of rows, of which only those in sight are elements: a tree may have 100,000 nodes.
 
 import { signOf } from "./episode.js";
-import { duration, element, recorded } from "./dom.js";
+import { duration, element, HUES, recorded } from "./dom.js";
 
 const ROW_PX = 26;
 const OPEN_MAX = 300;
@@ -17,6 +17,7 @@ export class TreeView {
     this.passing = new Set();
     this.size = 0;
     this.selected = null;
+    this.found = null; // the nodes that a search matches, and the way to each; null without a search
     this.event = episode.opens;
     this.spacer = element("div", { class: "rows", role: "presentation" });
     holder.append(this.spacer);
@@ -50,6 +51,7 @@ export class TreeView {
   /** Take in the nodes that the episode has by now; `show` draws them. */
   grow() {
     const { nodes } = this.episode;
+    if (this.found !== null) this.filter(this.found.test);
     if (nodes.length <= OPEN_MAX) for (const each of nodes.slice(this.size)) this.open.add(each);
     this.size = nodes.length;
     this.#list();
@@ -62,18 +64,44 @@ export class TreeView {
     if (this.size > OPEN_MAX) this.#list();
   }
 
+  /** List the nodes that a test matches and the ways to them, or all with null; return the matches. */
+  filter(test) {
+    this.found = null;
+    if (test !== null) {
+      const matches = this.episode.nodes.filter(test);
+      const ways = new Set();
+      for (const each of matches) for (let above = each.parent; above !== null && !ways.has(above); above = above.parent) ways.add(above);
+      this.found = { test, matches: new Set(matches), ways, open: new Set(ways) };
+    }
+    this.#list();
+    this.#draw();
+    return this.found?.matches ?? null;
+  }
+
+  /** The match that follows a node, or comes before it with a step of -1. */
+  matchBeside(node, step) {
+    const matches = [...(this.found?.matches ?? [])];
+    const index = matches.findLastIndex((each) => each.start <= (node?.start ?? 0));
+    const next = step > 0 ? index + 1 : index - (matches[index] === node ? 1 : 0);
+    return matches.at(next < matches.length ? next : 0);
+  }
+
   #isOpen(node) {
-    return this.open.has(node) || this.passing.has(node);
+    return this.found === null ? this.open.has(node) || this.passing.has(node) : this.found.open.has(node);
   }
 
   #list() {
     this.rows = [];
-    const visit = (node) => {
+    const { found } = this;
+    const isListed = (node) => found === null || found.matches.has(node) || found.ways.has(node);
+    const visit = (node, whole) => {
+      if (!whole && !isListed(node)) return;
       this.rows.push({ node });
       if (node.isRootFailure && node.message) this.rows.push({ node, message: true });
-      if (this.#isOpen(node)) node.children.forEach(visit);
+      const all = whole || (found !== null && !found.ways.has(node)); // what is below a match, once it is opened
+      if (this.#isOpen(node)) for (const each of node.children) visit(each, all);
     };
-    this.episode.roots.forEach(visit);
+    for (const each of this.episode.roots) visit(each, false);
     this.rowOf = new Map();
     this.rows.forEach(({ node, message }, index) => message || this.rowOf.set(node, index));
   }
@@ -94,14 +122,14 @@ export class TreeView {
   }
 
   reveal(node) {
-    for (let each = node.parent; each !== null; each = each.parent) this.open.add(each);
+    for (let each = node.parent; each !== null; each = each.parent) (this.found ?? this).open.add(each);
     this.#list();
     this.#bringIntoSight(node);
     this.#draw();
   }
 
   #bringIntoSight(node) {
-    if (node === null) return;
+    if (node === null || !this.rowOf.has(node)) return;
     const top = this.rowOf.get(node) * ROW_PX;
     const { scrollTop, clientHeight } = this.holder;
     if (top < scrollTop || top + 2 * ROW_PX > scrollTop + clientHeight) {
@@ -141,8 +169,9 @@ export class TreeView {
 
   #toggle(node, open = !this.#isOpen(node)) {
     this.passing.delete(node);
-    if (open) this.open.add(node);
-    else this.open.delete(node);
+    const listed = (this.found ?? this).open;
+    if (open) listed.add(node);
+    else listed.delete(node);
     this.#list();
     this.#draw();
   }
@@ -180,6 +209,14 @@ export class TreeView {
     return made;
   }
 
+  /** The robot that acts, where there are several: a spot of its colour, and its name where it begins to act. */
+  #robotOf(node) {
+    const { robots } = this.episode;
+    if (robots.length < 2 || !node.robot) return null;
+    const name = node.robot === node.parent?.robot ? null : recorded(node.robot);
+    return element("span", { class: `robot hue-${robots.indexOf(node.robot) % HUES}` }, name);
+  }
+
   #messageOf(node) {
     const classes = node.start > this.event ? "row message later" : "row message";
     const made = element("div", { class: classes, "aria-hidden": "true", title: node.message.slice(0, HINT_MAX) });
@@ -193,7 +230,8 @@ export class TreeView {
     if (this.running?.has(node)) classes.push("lit");
     if (node.start > this.event) classes.push("later");
     if (node === this.selected) classes.push("selected");
-    const toggle = element("span", { class: "toggle" }, node.children.length === 0 ? "" : open ? "▾" : "▸");
+    if (this.found?.matches.has(node)) classes.push("match");
+    const toggle = element("span", { class: "toggle", "aria-hidden": "true" }, node.children.length === 0 ? "" : open ? "▾" : "▸");
     if (node.children.length > 0) {
       toggle.addEventListener("click", (clicked) => {
         clicked.stopPropagation();
@@ -203,15 +241,14 @@ export class TreeView {
     const hidden = !open && node.children.length > 0 ? element("span", { class: "count" }, `${node.children.length}`) : null;
     const inside = !open && node.holdsFailure && !node.failed ? element("span", { class: "count bad" }, "✗ inside") : null;
     const took = node.end ? duration(this.episode.secondsAt(node.end) - this.episode.secondsAt(node.start)) : "";
-    const spoken = [node.name, node.status, node.reason, took && `took ${took}`, node.parameters, node.isRootFailure && node.message];
+    const spoken = (text) => (text ? element("span", { class: "spoken" }, `, ${text.slice(0, HINT_MAX)} `) : null);
     return element(
       "div",
       {
         class: classes.join(" "),
         role: "treeitem",
         id: `n${node.start}`,
-        title: node.parameters && `${node.name} ${node.parameters}`.slice(0, HINT_MAX),
-        "aria-label": spoken.filter(Boolean).join(", ").slice(0, HINT_MAX),
+        title: [node.name, node.robot && `by ${node.robot}`, node.parameters].filter(Boolean).join(" ").slice(0, HINT_MAX),
         "aria-posinset": node.place,
         "aria-setsize": (node.parent?.children ?? this.episode.roots).length,
         "aria-level": node.depth + 1,
@@ -219,12 +256,16 @@ export class TreeView {
         "aria-selected": String(node === this.selected),
       },
       toggle,
-      element("span", { class: "sign", title: node.status }, signOf(node.status)),
+      element("span", { class: "sign", title: node.status, "aria-hidden": "true" }, signOf(node.status)),
       recorded(node.name, { class: "name" }),
+      spoken(node.status),
+      this.#robotOf(node),
       hidden,
       inside,
       node.reason ? recorded(node.reason, { class: "reason" }) : null,
       element("span", { class: "parameters" }, recorded(node.parameters.slice(0, 200))),
+      spoken(node.isRootFailure && node.message),
+      spoken(took && "took"),
       element("span", { class: "took" }, took),
     );
   }

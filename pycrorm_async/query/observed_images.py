@@ -1,0 +1,253 @@
+"""Read what was observed as pictures: encoded images, arrays as images or depth maps, arrays and PCD files as points.
+
+An observation refers to its large contents as blobs (`Blob`, arrays of more than 64 elements). `contents_in` finds the
+references, `kind_of` says what a content can be shown as, and the others read it. What cannot be read raises
+`ValueError` with the reason. Pillow is needed only to make a large encoded image smaller.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.events.types import BLOB_KEY
+from pycrorm_async.record.values import NPY
+
+Kind = Literal["image", "depth", "points"]
+
+_SIGNATURES: Final = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg", b"GIF8": "image/gif"}
+_SIGNATURES_OF_WEBP: Final = b"RIFF", b"WEBP"
+_PCD_TYPES: Final = ("application/pcd", "application/x-pcd", "model/pcd", "text/x-pcd", "image/x-pcd")
+_SIDE_LEAST: Final = 8
+"""A table with fewer rows or columns is shown as numbers, not as a picture."""
+_COLUMNS_OF_POINTS: Final = range(3, 8)
+_PIXELS_MAX: Final = 50_000_000
+"""Bounds the pixels of an encoded image that is decoded, because a small file can claim any number of them."""
+_HEADER_MAX: Final = 4_096
+"""Bounds the header of a PCD file."""
+_POINTS_MAX: Final = 20_000_000
+_CHANNELS: Final = {1: 0, 3: 2, 4: 6}
+"""PNG's colour types by the number of channels."""
+_VIRIDIS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+"""Colours from near to far: five anchors of matplotlib's map viridis (CC0), whose lightness rises evenly."""
+
+
+class Content(NamedTuple):
+    """A content of an observation.
+
+    Attributes:
+        path: keys and indices that lead to it, joined by dots; empty if it is the whole observation.
+        hash, media_type, size: of its blob.
+        around: the entries beside it, such as the `encoding` of an image or the `pose` of a point cloud.
+    """
+
+    path: str
+    hash: str
+    media_type: str
+    size: int
+    shape: tuple[int, ...] | None
+    dtype: str | None
+    around: Mapping[str, Any]
+
+    @property
+    def kind(self) -> Kind | None:
+        """What it can be shown as, by its media type and its shape; None for anything else."""
+        if self.media_type.startswith("image/") and self.media_type not in _PCD_TYPES:
+            return "image"
+        if self.media_type in _PCD_TYPES:
+            return "points"
+        return None if self.media_type != NPY or self.shape is None else _kind_of(self.shape, self.dtype or "")
+
+
+def _kind_of(shape: tuple[int, ...], dtype: str) -> Kind | None:
+    is_table = len(shape) == 2
+    if is_table and shape[1] in _COLUMNS_OF_POINTS and dtype.startswith("float"):
+        return "points"
+    if min(shape[:2], default=0) < _SIDE_LEAST:
+        return None
+    if is_table:
+        return "image" if dtype == "uint8" else "depth"
+    return "image" if len(shape) == 3 and shape[2] in _CHANNELS and dtype == "uint8" else None
+
+
+def contents_in(values: Any, path: str = "", around: Mapping[str, Any] | None = None) -> Iterator[Content]:
+    """Yield the contents that the values of an observation refer to."""
+    if isinstance(values, Mapping):
+        if isinstance(name := values.get(BLOB_KEY), str):
+            shape, dtype = values.get("shape"), values.get("dtype")
+            described = None if shape is None else tuple(map(int, shape))
+            yield Content(path, name, str(values["media_type"]), int(values["size"]), described, dtype, around or {})
+            return
+        for key, each in values.items():
+            yield from contents_in(each, f"{path}.{key}" if path else key, values)
+    elif isinstance(values, list):
+        for index, each in enumerate(values):
+            yield from contents_in(each, f"{path}.{index}" if path else str(index))
+
+
+# === images ===================================================================================================
+
+
+def image_type(content: bytes) -> str:
+    """Return the media type of an encoded image by its first bytes. Raises `ValueError` for other contents."""
+    for signature, media_type in _SIGNATURES.items():
+        if content.startswith(signature):
+            return media_type
+    if (content[:4], content[8:12]) == _SIGNATURES_OF_WEBP:
+        return "image/webp"
+    raise ValueError("it is no PNG, JPEG, GIF or WebP image")
+
+
+def array_of(content: bytes) -> NDArray[Any]:
+    """Return a recorded array. Raises `ValueError`."""
+    try:
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+    except (ValueError, EOFError, OSError, SyntaxError, MemoryError) as error:
+        raise ValueError(f"it is no array: {error}") from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise ValueError("it is no array of numbers")
+    return array
+
+
+def pixels_of(content: Content, data: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a recorded array, height x width x channels. Raises `ValueError`.
+
+    A depth map is coloured.
+    """
+    array = array_of(data)
+    kind = _kind_of(array.shape, str(array.dtype))
+    if kind == "depth":
+        return colored(array)
+    if kind != "image":
+        raise ValueError(f"an array of shape {array.shape} is no image")
+    pixels = array.reshape(*array.shape[:2], -1)
+    is_bgr = pixels.shape[2] > 1 and str(content.around.get("encoding", "")).startswith("bgr")
+    return pixels[..., [2, 1, 0, *range(3, pixels.shape[2])]] if is_bgr else pixels
+
+
+def range_of(depth: NDArray[Any]) -> tuple[float, float]:
+    """Return the least and the greatest finite value of an array. Raises `ValueError` if it has none."""
+    finite = depth[np.isfinite(depth)]
+    if not finite.size:
+        raise ValueError("it has no finite number")
+    return float(finite.min()), float(finite.max())
+
+
+def colored(depth: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the pixels of a depth map: dark blue is the least value, yellow the greatest, black what is not finite."""
+    low, high = range_of(depth)
+    share = (depth.astype(np.float64) - low) / ((high - low) or 1.0)
+    places = np.clip(np.nan_to_num(share, nan=0.0), 0, 1)
+    anchors = np.array(_VIRIDIS, float)
+    channels = [np.interp(places, np.linspace(0, 1, len(anchors)), anchors[:, each]) for each in range(3)]
+    pixels = np.stack(channels, axis=-1).round().astype(np.uint8)
+    pixels[~np.isfinite(depth)] = 0
+    return pixels
+
+
+def smaller(pixels: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+    """Return every n-th pixel, so that neither side is longer than `side`."""
+    step = max(1, -(-max(pixels.shape[:2]) // side))
+    return pixels[::step, ::step]
+
+
+def png_of(pixels: NDArray[np.uint8], level: int = 6) -> bytes:
+    """Encode pixels, height x width x 1, 3 or 4 channels, as PNG (ISO/IEC 15948)."""
+    height, width, channels = pixels.shape
+    header = struct.pack(">IIBBBBB", width, height, 8, _CHANNELS[channels], 0, 0, 0)
+    rows = np.zeros((height, 1 + width * channels), np.uint8)  # each begins with its filter: none
+    rows[:, 1:] = pixels.reshape(height, -1)
+    body = zlib.compress(rows.tobytes(), level)
+    chunks = ((b"IHDR", header), (b"IDAT", body), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(each)) + name + each + struct.pack(">I", zlib.crc32(name + each)) for name, each in chunks
+    )
+
+
+def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
+    """Return a smaller JPEG of an encoded image or of pixels.
+
+    Raises `ValueError` for what is no image, and for one of more than 50 million pixels; `ImportError` without Pillow.
+    """
+    from PIL import Image
+
+    try:
+        if isinstance(image, bytes):
+            opened: Any = Image.open(io.BytesIO(image), formats=("PNG", "JPEG", "GIF", "WEBP"))
+            if opened.width * opened.height > _PIXELS_MAX:
+                raise ValueError(f"it has {opened.width} x {opened.height} pixels, more than {_PIXELS_MAX:,}")
+            opened.draft("RGB", (side, side))
+        else:
+            opened = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image)
+        opened.thumbnail((side, side))
+        file = io.BytesIO()
+        opened.convert("RGB").save(file, "JPEG", quality=72)
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"it cannot be decoded: {error}") from None
+    return file.getvalue()
+
+
+# === point clouds =============================================================================================
+
+
+def points_of(content: Content, data: bytes) -> NDArray[np.float32]:
+    """Return the finite points of a cloud, n x 3, m. Raises `ValueError`.
+
+    A `pose` (`PoseValue`) beside the cloud is the place of its frame, so that the points are in that of the pose.
+    """
+    table = _pcd(data) if content.media_type in _PCD_TYPES else array_of(data)
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise ValueError(f"an array of shape {table.shape} has no points")
+    points = table[:, :3].astype(np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    match content.around.get("pose"):
+        case {"position": [_, _, _] as position, "orientation": [x, y, z, w]}:
+            axis = np.array([x, y, z], float)
+            turned = np.cross(axis, points)
+            points = points + 2 * (w * turned + np.cross(axis, turned)) + np.array(position, float)
+    return points.astype(np.float32)
+
+
+def _pcd(data: bytes) -> NDArray[Any]:
+    """Return x, y and z of a file of the Point Cloud Library, format 0.7, as text or binary. Raises `ValueError`."""
+    head = data[:_HEADER_MAX]
+    begin = head.find(b"\nDATA ")
+    end = head.find(b"\n", begin + 1)
+    if begin < 0 or end < 0:
+        raise ValueError("it has no header of a PCD file")
+    lines = [each.split() for each in head[:begin].decode("latin-1").splitlines() if not each.startswith("#")]
+    fields = {name: rest for name, *rest in filter(None, lines)}
+    try:
+        counts = [int(each) for each in fields.get("COUNT", ["1"] * len(fields["FIELDS"]))]
+        kinds = [f"<{kind.lower()}{size}" for kind, size in zip(fields["TYPE"], fields["SIZE"], strict=True)]
+        described = list(zip(fields["FIELDS"], kinds, [(each,) for each in counts], strict=True))
+        number = _counted(int(fields["POINTS"][0]))
+        places = [fields["FIELDS"].index(axis) for axis in "xyz"]
+        form, body = head[begin + 6 : end].strip(), data[end + 1 :]
+        if form == b"ascii":
+            columns = [sum(counts[:each]) for each in places]
+            rows = [line.split() for line in body.decode("latin-1").splitlines()[:number] if line.strip()]
+            return np.array([[float(row[each]) for each in columns] for row in rows]).reshape(-1, 3)
+        _refuse_other_forms(form)
+        names = [(f"{index}", kind, count) for index, (_, kind, count) in enumerate(described)]
+        records = np.frombuffer(body, np.dtype(names), count=min(number, len(body) // np.dtype(names).itemsize))
+        return np.stack([records[str(each)][:, 0].astype(np.float64) for each in places], axis=1)
+    except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise ValueError(f"it is no PCD file that can be read: {error}") from None
+
+
+def _counted(number: int) -> int:
+    if not 0 <= number <= _POINTS_MAX:
+        raise ValueError(f"it has {number:,} points, more than {_POINTS_MAX:,}")
+    return number
+
+
+def _refuse_other_forms(form: bytes) -> None:
+    if form != b"binary":
+        raise ValueError(f"its data are {form.decode('latin-1')[:40]}, and only ascii and binary are read")
