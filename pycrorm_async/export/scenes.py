@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -20,6 +21,8 @@ from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.selection import CoveredEpisode
+from pycrorm_async.query import observed_images
+from pycrorm_async.query.observed_images import Content, Kind
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay, ReplayedNode, ReplayTime
 from pycrorm_async.query.scene import assumed_model, joint_pose, link_poses, object_model, point_model
@@ -51,6 +54,15 @@ class Change(NamedTuple):
         return self.when.sequence == self.object
 
 
+class Picture(NamedTuple):
+    """An observed image, depth map or point cloud. `data` is an encoded image, or pixels, a depth map or points."""
+
+    when: ReplayTime
+    name: str
+    kind: Kind
+    data: bytes | NDArray[Any]
+
+
 class PlanLine(NamedTuple):
     """The start or the end of a node as text. `label` is its type with the names of its objects."""
 
@@ -66,12 +78,18 @@ class ExportedEpisode(EpisodeReplay):
     Attributes:
         events: all of them, in order.
         changes: of the world, in order; an object's first one adds it.
+        contents: the images, depth maps and point clouds that were observed, with their names.
+        numbers: the numbers that were observed, by name.
+        pictures: what `contents` hold, as far as they can be read and a file has room.
     """
 
     def __init__(self, row: EpisodeRow, address: DatabaseAddress) -> None:
         super().__init__(row, address, strict=False, samples=True)
         self.events: list[ReplayTime] = []
         self.changes: list[Change] = []
+        self.contents: list[tuple[ReplayTime, str, Content]] = []
+        self.numbers: dict[str, list[tuple[ReplayTime, float]]] = {}
+        self.pictures: list[Picture] = []
         self._poses: dict[int, tuple[float, ...]] = {}
 
     def read(self, event: StoredEvent) -> event_types.Happening | None:
@@ -89,6 +107,12 @@ class ExportedEpisode(EpisodeReplay):
                 self._sampled(happening.object.object, happening.channels)
             case event_types.ObjectRemoved():
                 self._change(happening.object.object, removed=True)
+            case event_types.Observed():
+                for each in observed_images.contents_in(happening.values):
+                    if each.kind is not None:
+                        self.contents.append((self.at, f"{happening.name}.{each.path}".rstrip("."), each))
+                for name, number in observed_images.numbers_in(happening.name, happening.values):
+                    self.numbers.setdefault(name, []).append((self.at, number))
         return happening
 
     def _change(
@@ -286,9 +310,49 @@ def _subtasks(episode: ExportedEpisode, at: Sequence[ReplayTime]) -> Iterator[st
         yield running[0][1] if running else IDLE
 
 
+# === pictures =================================================================================================
+
+_PICTURES_BYTES_MAX = 512_000_000
+"""Bounds the bytes of the pictures of a file, which are in memory while it is written."""
+_log = logging.getLogger(__name__)
+
+
+async def read_pictures(reading: Reading, episode: ExportedEpisode) -> None:
+    """Read the contents of an episode into its pictures; of more than a file has room for, every n-th."""
+    log = await reading.log()
+    step = -(-sum(content.size for _, _, content in episode.contents) // _PICTURES_BYTES_MAX) or 1
+    for when, name, content in episode.contents[::step]:
+        with log.translated():
+            data = await log.blobs.read_blob(content.hash)
+        try:
+            if data is None:
+                raise ValueError("its content is not in the log")  # noqa: TRY301  all reasons are logged alike
+            picture = await asyncio.to_thread(_picture, when, name, content, data)
+        except ValueError as reason:
+            _log.warning("event %d: %s is left out: %s", when.sequence, name, reason)
+        else:
+            episode.pictures.append(picture)
+    if step > 1:
+        _log.warning("of %d observed pictures, the file has one in %d", len(episode.contents), step)
+
+
+def _picture(when: ReplayTime, name: str, content: Content, data: bytes) -> Picture:
+    if content.kind == "points":
+        return Picture(when, name, "points", observed_images.points_of(content, data))
+    if content.kind == "depth":
+        return Picture(when, name, "depth", observed_images.array_of(data))
+    if content.media_type.startswith("image/"):
+        observed_images.image_type(data)
+        return Picture(when, name, "image", data)
+    return Picture(when, name, "image", observed_images.pixels_of(content, data))
+
+
 # === mcap file ================================================================================================
 #
 # Write an episode as MCAP with Foxglove's schemas: `/tf`, `/scene`, `/plan`.
+#
+# `/camera/NAME` has a `CompressedImage` of each observed image, depth maps in colours, `/cloud/NAME` the points of each
+# cloud, and `/joint_states/ROBOT` the joints of a robot whenever they change.
 #
 # `/tf` has a `FrameTransforms` for each event that moved objects or joints, `/scene` a `SceneUpdate` with the shapes of
 # each object, in the frames of its links, and the deletion when it is removed, and `/plan` a `Log` for the start and
@@ -337,8 +401,12 @@ def write_mcap(
             _transforms(episode, objects, messages, stamp),
             _scene(episode, objects, messages, stamp),
             _plan(episode, messages, stamp),
+            _joint_states(episode, objects, messages, stamp),
+            _pictures(episode, messages, stamp),
         )
         for when, topic, content in heapq.merge(*of_topics, key=lambda message: message[0].sequence):
+            if topic not in channels:
+                channels[topic] = _channel(writer, topic, type(content))
             writer.add_message(channels[topic], time_ns(when), content.encode(), time_ns(when), when.sequence)
             count += 1
             if count % REPORTED_CHANGES == 0:
@@ -420,6 +488,38 @@ def _plan(episode: ExportedEpisode, kinds: Any, stamp: _Stamp) -> Iterator[_Mess
         yield line.when, "/plan", log
 
 
+def _joint_states(
+    episode: ExportedEpisode, objects: Mapping[int, SceneObject], kinds: Any, stamp: _Stamp
+) -> Iterator[_Message]:
+    positions: dict[int, dict[str, float]] = {}
+    for change in episode.changes:
+        if not change.joints or episode.world.added[change.object].object_type != "ROBOT":
+            continue
+        joints = positions.setdefault(change.object, {})
+        joints.update(change.joints)
+        states = [kinds.JointState(name=name, position=position) for name, position in joints.items()]
+        topic = f"/joint_states/{objects[change.object].name}"
+        yield change.when, topic, kinds.JointStates(timestamp=stamp(change.when), joints=states)
+
+
+def _pictures(episode: ExportedEpisode, kinds: Any, stamp: _Stamp) -> Iterator[_Message]:
+    real = kinds.PackedElementFieldNumericType.Float32
+    for when, name, kind, data in episode.pictures:
+        if kind == "points":
+            fields = [kinds.PackedElementField(name=each, offset=4 * at, type=real) for at, each in enumerate("xyz")]
+            points = np.asarray(data, "<f4").tobytes()
+            described = {"frame_id": MAP, "point_stride": 12, "fields": fields, "data": points}
+            yield when, f"/cloud/{_named(name)}", kinds.PointCloud(timestamp=stamp(when), **described)
+            continue
+        if isinstance(data, bytes):
+            encoded, form = data, observed_images.image_type(data).removeprefix("image/")
+        else:
+            pixels = observed_images.colored(data) if kind == "depth" else data
+            encoded, form = observed_images.png_of(pixels, 1), "png"
+        image = kinds.CompressedImage(timestamp=stamp(when), frame_id=name, data=encoded, format=form)
+        yield when, f"/camera/{_named(name)}", image
+
+
 def _vector(kinds: Any, values: Sequence[float]) -> Any:
     return kinds.Vector3(**dict(zip("xyz", values, strict=True)))
 
@@ -436,6 +536,8 @@ def _rotation(kinds: Any, values: Sequence[float]) -> Any:
 # are one column (`send_columns`), so that a recording is small and opens at once.
 
 _APPLICATION = "pycrorm"
+_VIEWS_MAX = 4
+"""Bounds the cameras that have a view when a recording is opened."""
 
 
 def write_rerun(
@@ -485,6 +587,7 @@ def write_rerun(
     recording.reset_time()
     count += _send_removals(rr, recording, episode, objects, entities)
     count += _send_plan(rr, recording, episode)
+    count += _send_observed(rr, recording, episode)
     recording.flush()
     path.write_bytes(encoded.drain_as_bytes())
     recording.disconnect()
@@ -494,6 +597,11 @@ def write_rerun(
 def _part(frame: str) -> str:
     """Return the last part of an entity path, without the characters that have a meaning in rerun."""
     return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
+
+
+def _named(observation: str) -> str:
+    """Return the name of an observation as one part of a topic or an entity path."""
+    return _part(observation.replace("/", "_"))
 
 
 def _indexes(rr: Any, whens: Sequence[ReplayTime]) -> list[Any]:
@@ -553,6 +661,36 @@ def _send_plan(rr: Any, recording: Any, episode: ExportedEpisode) -> int:
             ),
         )
     return len(lines)
+
+
+def _send_observed(rr: Any, recording: Any, episode: ExportedEpisode) -> int:
+    """Send the observed pictures and numbers, and how the viewer lays them out beside the scene; return their count."""
+    cameras: dict[str, str] = {}
+    for when, name, kind, data in episode.pictures:
+        recording.set_time("event", sequence=when.sequence)
+        recording.set_time("time", duration=when.since_ns / 1e9)
+        if kind == "points":
+            recording.log(f"world/clouds/{_named(name)}", rr.Points3D(data, radii=rr.Radius.ui_points(1.5)))
+            continue
+        entity = cameras.setdefault(name, f"cameras/{_named(name)}")
+        if isinstance(data, bytes):
+            recording.log(entity, rr.EncodedImage(contents=data, media_type=observed_images.image_type(data)))
+        else:
+            recording.log(entity, rr.DepthImage(data) if kind == "depth" else rr.Image(data.squeeze()))
+    recording.reset_time()
+    for name, numbers in episode.numbers.items():
+        recording.send_columns(
+            f"numbers/{_named(name)}",
+            indexes=_indexes(rr, [when for when, _ in numbers]),
+            columns=rr.Scalars.columns(scalars=[number for _, number in numbers]),
+        )
+    views = rr.blueprint
+    seen = [views.Spatial2DView(origin=entity, name=name) for name, entity in list(cameras.items())[:_VIEWS_MAX]]
+    curves = [views.TimeSeriesView(origin="numbers", name="numbers")] if episode.numbers else []
+    beside = views.Vertical(*seen, *curves, views.TextLogView(origin="plan", name="plan"))
+    scene = views.Spatial3DView(origin="world", name="scene")
+    recording.send_blueprint(views.Blueprint(views.Horizontal(scene, beside, column_shares=[2, 1])))
+    return len(episode.pictures) + sum(map(len, episode.numbers.values()))
 
 
 # === scene frames =============================================================================================
@@ -699,6 +837,7 @@ async def write_scene(write: _WriteScene, job: Job, path: Path) -> Written:
     [covered] = job.selection.episodes
     episode = await read_episode(ExportedEpisode, job.reading, covered, job.reporter("reading"))
     objects = await scene_objects(job.reading, episode)
+    await read_pictures(job.reading, episode)
     report = job.reporter("writing")
     # A cancelled task waits for the end of the thread: a file that is deleted while it writes would crash the process.
     count = await run_to_completion(asyncio.to_thread(write, episode, objects, path, report, job.options))

@@ -24,6 +24,8 @@ Kind = Literal["image", "depth", "points"]
 _SIGNATURES: Final = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg", b"GIF8": "image/gif"}
 _SIGNATURES_OF_WEBP: Final = b"RIFF", b"WEBP"
 _PCD_TYPES: Final = ("application/pcd", "application/x-pcd", "model/pcd", "text/x-pcd", "image/x-pcd")
+_ITEMS_MAX: Final = 8
+"""Bounds the numbers of a list that have curves: as many as a wrench, a quaternion or the joints of an arm have."""
 _SIDE_LEAST: Final = 8
 """A table with fewer rows or columns is shown as numbers, not as a picture."""
 _COLUMNS_OF_POINTS: Final = range(3, 8)
@@ -89,6 +91,19 @@ def contents_in(values: Any, path: str = "", around: Mapping[str, Any] | None = 
     elif isinstance(values, list):
         for index, each in enumerate(values):
             yield from contents_in(each, f"{path}.{index}" if path else str(index))
+
+
+def numbers_in(name: str, values: Any) -> list[tuple[str, float]]:
+    """Return the numbers of an observation, two levels deep, by name."""
+    if isinstance(values, bool):
+        return []
+    if isinstance(values, int | float):
+        return [(name, float(values))]
+    if isinstance(values, dict) and BLOB_KEY not in values and name.count(".") < 2:
+        return [pair for key, each in values.items() for pair in numbers_in(f"{name}.{key}", each)]
+    if isinstance(values, list) and len(values) <= _ITEMS_MAX and name.count(".") < 2:
+        return [pair for index, each in enumerate(values) for pair in numbers_in(f"{name}.{index}", each)]
+    return []
 
 
 # === images ===================================================================================================

@@ -24,7 +24,7 @@ from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.query.observed_images import contents_in
+from pycrorm_async.query.observed_images import contents_in, numbers_in
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay, ReplayedWorld
 from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
@@ -49,8 +49,6 @@ _CURVE_POINTS_MAX = 2_000
 _LISTS = "detections", "observations", "locations"
 _LISTED_MAX = 20_000
 """Bounds the percepts, observations and location resolutions of a page, each; the page counts the others."""
-_ITEMS_MAX = 8
-"""Bounds the numbers of a list that have curves: as many as a wrench, a quaternion or the joints of an arm have."""
 _VALUES_MAX = 2_000
 """Bounds the characters of an observation's values in the page."""
 
@@ -154,7 +152,7 @@ class EpisodePage(EpisodeReplay):
         if len(self.contents) < _LISTED_MAX:
             found = [each for each in contents_in(observed.values) if each.kind is not None]
             self.contents += [ObservedContent(sequence, observed.node or 0, observed.name, each) for each in found]
-        for path, number in _numbers_in(observed.name, observed.values):
+        for path, number in numbers_in(observed.name, observed.values):
             self._series.setdefault(path, Track(self._first)).set(sequence, number)
 
     def document(self, models: Mapping[str, Any], pictures: Mapping[str, Any], *, after: int = 0) -> dict[str, Any]:
@@ -301,19 +299,6 @@ def _location(sequence: int, resolved: event_types.LocationResolved) -> dict[str
         "refused": refused,
         "excluded": {name: count for name, count in excluded.items() if count},
     }
-
-
-def _numbers_in(name: str, values: Any) -> list[tuple[str, float]]:
-    """Return the numbers of an observation, two levels deep, by name."""
-    if isinstance(values, bool):
-        return []
-    if isinstance(values, int | float):
-        return [(name, float(values))]
-    if isinstance(values, dict) and name.count(".") < 2:
-        return [pair for key, each in values.items() for pair in _numbers_in(f"{name}.{key}", each)]
-    if isinstance(values, list) and len(values) <= _ITEMS_MAX and name.count(".") < 2:
-        return [pair for index, each in enumerate(values) for pair in _numbers_in(f"{name}.{index}", each)]
-    return []
 
 
 def _cut(text: str) -> str:

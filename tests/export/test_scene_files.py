@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,13 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.events.types import Blob
 from pycrorm_async.export.export import FORMATS, export, export_again
 from pycrorm_async.export.scenes import write_mcap, write_rerun, write_scene
 from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.scene import link_poses, object_model
+from pycrorm_async.world import Pose
 from pycrorm_async.world.bounding_boxes import rotation_matrix
 from tests.full_disk import files_of_at_most
 
@@ -74,7 +78,7 @@ async def test_an_mcap_file_has_frames_shapes_and_the_plan_of_the_episode(readin
     exported = await export(reading, 1, tmp_path / "one.mcap")
     messages = messages_of(tmp_path / "one.mcap")
     assert exported.rows == len(messages)
-    assert {topic for topic, *_ in messages} == {"/tf", "/scene", "/plan"}
+    assert {topic for topic, *_ in messages} == {"/tf", "/scene", "/plan", "/joint_states/pr2"}
     for moment in await moments_of(reading):
         frames: Frames = {}
         for topic, sequence, _, content in messages:
@@ -220,3 +224,58 @@ async def test_what_a_scene_file_cannot_hold_is_named(
     with pytest.raises(CallerError, match=message):
         await export(reading, what, tmp_path / "a.mcap", **options)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+async def seen(tmp_path: Path) -> AsyncIterator[Reading]:
+    """Yield a memory of a robot that observed an image, a depth map, pixels, a cloud, numbers, and what is no image."""
+    url = f"sqlite:///{tmp_path / 'seen.db'}"
+    with Memory.sync(url) as memory:
+        with memory.recording.episode(description="what it saw") as episode:
+            episode.object_added("robot", "agv", "ROBOT", Pose([0, 0, 0]), joints={"lift": 0.0})
+            episode.observe("head/camera", {"rgb": Blob(png_of(PIXELS), "image/png"), "exposure": 0.25})
+            episode.joints_moved("robot", {"lift": 0.5})
+            episode.observe("depth", np.linspace(0.5, 2, 400, dtype=np.float32).reshape(20, 20))
+            episode.observe("pixels", PIXELS)
+            episode.observe("lidar", np.arange(300, dtype=np.float32).reshape(100, 3))
+            episode.observe("fake", Blob(b"no image", "image/png"))
+        memory.flush()
+    async with Reading.open(url) as reading:
+        yield reading
+
+
+PIXELS = np.random.default_rng(0).integers(0, 255, (16, 24, 3), np.uint8)
+
+
+async def test_an_mcap_file_has_what_was_observed_and_the_joints(
+    seen: Reading, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    await export(seen, 1, tmp_path / "seen.mcap")
+    assert "fake is left out: it is no PNG" in caplog.text
+    by_topic = {topic: content for topic, _, _, content in messages_of(tmp_path / "seen.mcap")}
+    assert by_topic.keys() - {"/tf", "/scene", "/plan"} == {
+        "/camera/head_camera.rgb",
+        "/camera/depth",
+        "/camera/pixels",
+        "/cloud/lidar",
+        "/joint_states/agv",
+    }
+    image = by_topic["/camera/head_camera.rgb"]
+    assert (image.format, image.data) == ("png", png_of(PIXELS))
+    points = by_topic["/cloud/lidar"]
+    assert np.frombuffer(points.data, "<f4").reshape(-1, 3).tolist() == np.arange(300).reshape(100, 3).tolist()
+    assert [(each.name, each.position) for each in by_topic["/joint_states/agv"].joints] == [("lift", 0.5)]
+
+
+async def test_a_rerun_recording_has_what_was_observed_and_a_layout(seen: Reading, tmp_path: Path) -> None:
+    await export(seen, 1, tmp_path / "seen.rrd")
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(tmp_path / "seen.rrd")
+    chunks = {each.entity_path: each for each in reader.stream()}
+    assert {"/cameras/head_camera.rgb", "/cameras/depth", "/cameras/pixels", "/world/clouds/lidar"} <= chunks.keys()
+    [encoded] = chunks["/cameras/head_camera.rgb"].to_record_batch().to_pylist()
+    assert bytes(encoded["EncodedImage:blob"][0]) == png_of(PIXELS)
+    numbers = [each for each in chunks if each.startswith("/numbers/")]
+    assert numbers == ["/numbers/head_camera.exposure"]  # and not the size of a blob
+    assert len(reader.blueprints()) == 1

@@ -109,6 +109,7 @@ export class SeenView {
 
   #press(pressed) {
     pressed.stopPropagation();
+    if (pressed.key === "Escape") this.dialog.close();
     const by = { ArrowLeft: -1, ArrowRight: 1 }[pressed.key];
     if (by === undefined) return;
     pressed.preventDefault();
