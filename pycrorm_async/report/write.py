@@ -89,7 +89,8 @@ async def report(
     document["outcomes"] = await outcomes_of(reading, document["episode"]["number"])
     similar = similar or SimilarCases(reading)
     document["similar"] = await similar.document(document["episode"]["number"], document["nodes"][0])
-    document["episode"]["overview"] = back
+    if back:
+        document["episode"]["overview"] = back
     file = Path(path) if path is not None else Path(page_name(document["episode"]["number"]))
     await asyncio.to_thread(lambda: write_file(page_of(document).encode(), file, force=force))
     shown = document["episode"]
