@@ -153,12 +153,14 @@ def _with_tool_errors(tool: _Function, tools: _Tools) -> _Function:
             if isinstance(error, DatabaseError):
                 await tools.close()
             raise ToolError(visible(one_line(error, _ERROR_MAX))) from error
-        if isinstance(result, bytes):
-            return Image(data=result, format="png")
-        text = visible(result) if isinstance(result, str) else _json(_short(msgspec.to_builtins(result, enc_hook=str)))
-        if (size := len(text.encode())) > _ANSWER_BYTES:
+        if isinstance(result, str):
+            result = visible(result)
+        elif not isinstance(result, bytes):
+            result = _json(_short(msgspec.to_builtins(result, enc_hook=str)))
+        size = len(result.encode() if isinstance(result, str) else result)
+        if size > _ANSWER_BYTES:
             raise ToolError(f"the answer has {size} bytes, but at most {_ANSWER_BYTES} are returned: ask for less")
-        return text
+        return result if isinstance(result, str) else Image(data=result, format="png")
 
     return answer
 

@@ -23,9 +23,9 @@ function alignedNodes(roots, otherRoots) {
   const stack = siblingPairs(roots, otherRoots, null).reverse();
   while (stack.length > 0) {
     const row = stack.pop();
-    rows.push(row);
+    row.number = rows.push(row) - 1;
     const [children, others] = row.nodes.map((each) => each?.children ?? []);
-    stack.push(...siblingPairs(children, others, row).reverse());
+    for (const each of siblingPairs(children, others, row).reverse()) stack.push(each);
   }
   return rows;
 }
@@ -152,8 +152,7 @@ class Comparison {
 
   #row(row) {
     const node = row.nodes[0] ?? row.nodes[1];
-    const number = this.rows.indexOf(row);
-    const name = element("button", { type: "button", class: "link", "data-row": number, title: `show the scenes at its end ${node.parameters}`.slice(0, TEXT_MAX), onclick: () => this.#select(row) }, recorded(node.name));
+    const name = element("button", { type: "button", class: "link", "data-row": row.number, title: `show the scenes at its end ${node.parameters}`.slice(0, TEXT_MAX), onclick: () => this.#select(row) }, recorded(node.name));
     const place = element("td", { class: "node" }, name);
     place.style.paddingInlineStart = `${Math.min(row.depth, INDENTS_MAX) * INDENT_PX}px`;
     const marks = row.marks.map(([kind, text]) => element("span", { class: `mark is-${kind}` }, text));
