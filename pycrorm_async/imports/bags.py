@@ -9,6 +9,7 @@ The memory that an import takes does not grow with the bag.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -48,7 +49,8 @@ class _Message(NamedTuple):
 
 def read_bag(path: Path, settings: RosMap, intake: Intake) -> None:
     """Give the episode of a bag to the intake. Raises `WrongFormat` and `MissingExtra`."""
-    files = sorted(each for each in path.iterdir() if each.suffix in (".mcap", ".db3")) if path.is_dir() else [path]
+    files = [each for each in path.iterdir() if each.suffix in (".mcap", ".db3")] if path.is_dir() else [path]
+    files.sort(key=_numbered)
     if not files:
         raise intakes.WrongFormat(f"{path} has no .mcap or .db3 file")
     decoder = _Decoder()
@@ -85,6 +87,12 @@ def read_bag(path: Path, settings: RosMap, intake: Intake) -> None:
             intake.left_out(f"messages of {topic}", why, count)
         for (topic, type_name), count in undecoded.items():
             intake.left_out(f"messages of {topic}", f"they cannot be decoded as {type_name}", count)
+
+
+def _numbered(file: Path) -> list[str | int]:
+    """Return a key by which bag_10.mcap comes after bag_2.mcap."""
+    parts = re.split(r"([0-9]+)", file.name)
+    return [int(each) if index % 2 else each for index, each in enumerate(parts)]
 
 
 FORMAT = intakes.ImportFormat(read_bag, "bags of ROS 2: MCAP, .db3, and folders of rosbag2", RosMap)

@@ -271,6 +271,16 @@ def test_definitions_of_the_file_decode_goals_and_unknown_types_are_counted(tmp_
     }
 
 
+def test_the_files_of_a_bag_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    for number in (0, 2, 10):
+        row = tf_row(number * 1000, ("map", "cup", (float(number), 0.0, 0.0), 0.0))
+        [file] = bag(tmp_path / f"part{number}", [row]).glob("*.mcap")
+        file.rename(tmp_path / "bag" / f"bag_{number}.mcap")
+    imported(tmp_path, "rosbag2", tmp_path / "bag")
+    assert [x for _, _, x, *_ in poses(tmp_path / "memory.db")] == [0, 2, 10]
+
+
 def test_messages_in_another_encoding_are_counted_whatever_their_topic_is(tmp_path: Path) -> None:
     with (tmp_path / "foxglove.mcap").open("wb") as written:
         writer = mcap.writer.Writer(written)
