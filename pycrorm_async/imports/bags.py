@@ -1,8 +1,9 @@
 """Import bags of ROS 2: MCAP files, `.db3` files of rosbag2, and folders of rosbag2 with several of them.
 
-A bag is an episode. `ros_messages` gives its messages to it; this module reads files. An MCAP file is read in the order
-of its records, also one that was never finished. Messages are decoded by rosbags, with the definitions that the file
-has, else with those of the latest ROS 2; transforms by a decoder of our own, because they are most of a bag.
+A bag is an episode. `ros_messages` gives its messages to it; this module reads files. An MCAP file is read chunk by
+chunk, also one that was never finished, and the messages of a chunk in the order of their times. Messages are decoded
+by rosbags, with the definitions that the file has, else with those of the latest ROS 2; transforms by a decoder of our
+own, because they are most of a bag.
 
 The memory that an import takes does not grow with the bag.
 """
@@ -148,8 +149,8 @@ def _messages(path: Path, intake: Intake) -> Iterator[_Message]:
 def _mcap_messages(path: Path, intake: Intake) -> Iterator[_Message]:
     try:
         from mcap.exceptions import McapError
-        from mcap.records import Channel, Message, Schema
-        from mcap.stream_reader import StreamReader
+        from mcap.records import Channel, Chunk, Message, Schema
+        from mcap.stream_reader import StreamReader, breakup_chunk
         from zstandard import ZstdError
     except ImportError:
         raise MissingExtra("bags need mcap and rosbags: pip install 'pycrorm-async[ros]'") from None
@@ -158,7 +159,12 @@ def _mcap_messages(path: Path, intake: Intake) -> Iterator[_Message]:
     topics: dict[int, tuple[str, str, str]] = {}
     count = 0
     with path.open("rb") as file:
-        records = StreamReader(file, record_size_limit=size).records
+        records = chain.from_iterable(
+            sorted(breakup_chunk(each), key=lambda record: getattr(record, "log_time", -1))
+            if isinstance(each, Chunk)
+            else (each,)
+            for each in StreamReader(file, emit_chunks=True, record_size_limit=size).records
+        )
         while True:
             try:
                 record = next(records, None)

@@ -300,9 +300,19 @@ def test_frames_in_a_circle_and_times_that_go_back_end_no_import(tmp_path: Path)
         tf_row(-3_600_000, ("map", "cup", (2.0, 0.0, 0.0), 0.0)),
         tf_row(-3_599_000, ("map", "'; DROP TABLE event; --\x1b", (3.0, 0.0, math.nan), 0.0)),
     ]
-    report = imported(tmp_path, "mcap", bag(tmp_path / "b", rows), faults=1)  # the first time that goes back
+    folder, later = bag(tmp_path / "b", rows[:2]), bag(tmp_path / "later", rows[2:])
+    next(later.glob("*.mcap")).rename(folder / "later.mcap")
+    report = imported(tmp_path, "mcap", folder, faults=1)  # the first time that goes back
     assert [(name, x) for name, _, x, *_ in poses(tmp_path / "memory.db")] == [("cup", 1.0), ("cup", 2.0)]
     assert report.episodes[0].objects == 1
+
+
+def test_messages_of_a_chunk_that_were_written_late_come_at_their_times(tmp_path: Path) -> None:
+    poses_first = [tf_row(ms, ("map", "base_link", (ms / 1000, 0.0, 0.0), 0.0)) for ms in range(0, 10_000, 100)]
+    rows = [*poses_first, status_row(1_000, "/go", (1, 1_000, 2)), status_row(4_000, "/go", (1, 1_000, 4))]
+    imported(tmp_path, "mcap", bag(tmp_path / "b", rows))
+    question = "SELECT start_time, end_time FROM task_tree_node WHERE dtype = 'Go'"
+    assert ask(tmp_path / "memory.db", question) == [((AT + 1_000 * MS) // 1000, (AT + 4_000 * MS) // 1000)]
 
 
 def test_the_map_file_of_the_page_has_keys_of_this_format(tmp_path: Path) -> None:
