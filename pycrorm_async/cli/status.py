@@ -231,7 +231,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
                 "running": state.running,
                 "running_total": state.running_total,
                 "went_back": [each._asdict() for each in state.went_back],
-                "placement": state.placement._asdict(),
+                "placement": state.placement.to_print(),
                 "core": {"compiled": core.IS_COMPILED, "reason": core.PURE_REASON},
             }
         )
@@ -242,7 +242,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
         _print_workers(workers)
         print_durability(kept, state.stored_on, state.went_back)
         if state.placement != PLAIN:
-            stdout.print(f"The memory's tables have {state.placement}.", markup=False)
+            stdout.print(f"Placement of the memory: {state.placement}.", markup=False)
         for projection in state.projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)

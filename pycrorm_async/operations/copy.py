@@ -30,7 +30,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress, shared_address
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
-from pycrorm_async.store.placement import PLAIN
+from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry
 
@@ -99,7 +99,7 @@ async def copy_episodes(
 @asynccontextmanager
 async def _open_target(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tuple[EventLog, LogAndTables]]:
     """Open the target's log and tables, creating them if they are missing, with the source's placement if possible."""
-    placement = PLAIN if address.is_sqlite else await source.placement()
+    placement = PLAIN if address.is_sqlite else Placement((await source.placement()).partitions)
     log = await EventLog.open(address, create=True, placement=placement)
     try:
         if log.log_id == source.log_id:

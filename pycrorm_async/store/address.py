@@ -28,6 +28,7 @@ from sqlalchemy.ext.asyncio import AsyncEngine
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownUrl
 from pycrorm_async.store import postgresql_engine as postgresql
 from pycrorm_async.store import sqlite_engine as sqlite
+from pycrorm_async.store.placement import Shard
 
 BUSY_TIMEOUT_S = 5.0
 """Bounds the wait of a statement for another writer; beyond it the database counts as unavailable."""
@@ -128,6 +129,13 @@ class DatabaseAddress:
         if not self.is_sqlite:
             return postgresql.make_engine(self._url, read_only=read_only, busy_timeout_s=busy_timeout_s)
         return sqlite.make_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
+
+    def as_shard(self) -> Shard:
+        """Return this database on a server as one that keeps events of a memory."""
+        where = {name: self._url.normalized_query.get(name, ("",))[-1] for name in postgresql.WHERE}
+        url = self._url
+        host, port = url.host or where["host"] or "localhost", str(url.port or where["port"] or 5432)
+        return Shard(host, port, url.database or "", url.username, str(url.password) if url.password else None)
 
     @property
     def to_type(self) -> str:

@@ -23,10 +23,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from hashlib import sha256
+from itertools import chain
 from types import MappingProxyType
 from typing import Final, NamedTuple, Protocol
 
@@ -292,6 +294,10 @@ _PART_EVENTS: Final = 1_024
 the next are computed."""
 
 
+class StoredAhead(InternalError):
+    """The log has events behind the head of their episode: on a shard a crash leaves them, elsewhere a defect did."""
+
+
 class _Plan(NamedTuple):
     """The changes that the batch makes to episodes whose rows are `known_rows`."""
 
@@ -306,6 +312,7 @@ class Appending:
 
     `witness` is an episode and its confirmed head. A new episode gets its number in `numbers` if no other has it. What
     was erased or archived is not stored again; with `restoring`, archived episodes are, under their numbers.
+    With `are_stored` the events are in the log already, behind the heads of their episodes, which `write` advances.
     """
 
     def __init__(
@@ -317,8 +324,10 @@ class Appending:
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
         restoring: bool = False,
+        are_stored: bool = False,
     ) -> None:
         self._restoring = restoring
+        self._are_stored = are_stored
         self._dialect = dialect
         self._digests = digests
         self._witness = witness
@@ -358,10 +367,13 @@ class Appending:
             await dialect.execute(connection, schema.UPSERT_EPISODES, rows=rows)
             self.warnings = warnings_of(changed)
         if any(each.fresh for each in plan.steps.values()):
-            try:
-                await dialect.insert(connection, plan.insertion)
-            except RowRefused as error:
-                raise InternalError(f"events behind the head of their episode are stored already: {error}") from error
+            if self._are_stored:
+                deque(chain.from_iterable(plan.insertion.values()), 0)  # computes the digests
+            else:
+                try:
+                    await dialect.insert(connection, plan.insertion)
+                except RowRefused as error:
+                    raise StoredAhead(f"events behind the head of their episode are stored already: {error}") from error
             if self._digests is not None and plan.digests is not None:
                 await self._digests.insert(connection, plan.digests)
                 self.extension = plan.digests
@@ -373,6 +385,15 @@ class Appending:
         }
         refusals |= {each: reason for each, reason in stopped.items() if reason is not None}
         return Stored(refusals, {each: change.after for each, change in plan.steps.items()})
+
+    async def create_rows(self, connection: AsyncConnection) -> None:
+        """Create the rows of the batch's new episodes, without events."""
+        present = await self._read_rows(connection)
+        if self._batch.episodes.keys() <= present.keys():
+            return
+        rows, _ = await self._read_or_create_rows(connection)
+        new = [(*row[:3], row.started_wall_ns, None, None) for each, row in rows.items() if each not in present]
+        await self._dialect.execute(connection, schema.UPSERT_EPISODES, rows=new)
 
     async def _make_plan(self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
         steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}

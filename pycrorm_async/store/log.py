@@ -28,7 +28,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, is_episode_id
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, is_episode_id
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store import schema
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
@@ -37,6 +37,7 @@ from pycrorm_async.store.append import (
     Appending,
     Blobs,
     RunningDigests,
+    StoredAhead,
     events_warning,
     number_warning,
     removed_of,
@@ -86,6 +87,7 @@ class EventLog:
         self._warned: set[str] = set()
         self.discarded: dict[str, int] = {}
         """The number of events that arrived of removed episodes and were discarded, by the id of the episode."""
+        self._shards: bool | None = False if address.is_sqlite else None
         self.blobs = Blobs(self._dialect, self.reading, self.writing)
         self.digests: RunningDigests | None = RunningDigests(self._dialect)
         """The digests of the episodes that this process appends to; None, for a benchmark, stores none."""
@@ -164,21 +166,55 @@ class EventLog:
             return Stored({}, {})
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
-            appending = Appending(
-                self._dialect,
-                records,
-                self.digests,
-                witness=witness,
-                numbers=numbers,
-                restoring=self.blobs.restores,
-            )
-            if self._write_turn is not None and len(records) >= _MANY_EVENTS:
-                async with self.reading() as connection:
-                    await appending.prepare(connection)
-            async with self.writing() as connection:
-                stored = await appending.write(connection)
-            if self.digests is not None and appending.extension is not None:
-                self.digests.keep(appending.extension)
+            if not await self._has_shards():
+                return await self._append(records, witness=witness, numbers=numbers)
+            async with self.writing() as connection:  # before an event with its number is on a shard
+                rows = Appending(self._dialect, records, numbers=numbers, restoring=self.blobs.restores)
+                await rows.create_rows(connection)
+            try:
+                return await self._append(records, witness=witness, numbers=numbers)
+            except StoredAhead:
+                await self._adopt({each.episode for each in records if each.episode is not None})
+                return await self._append(records, witness=witness, numbers=numbers)
+
+    async def _has_shards(self) -> bool:
+        if self._shards is None:
+            self._shards = bool((await self.placement()).shards)
+        return self._shards
+
+    async def _adopt(self, episodes: Collection[EpisodeId]) -> None:
+        """Advance the heads of these episodes over events that a crash left on a shard (`store.placement`)."""
+        for row in (await self.heads(list(episodes))).values():
+            ahead = await self.spans([Span(row.number, row.head, SEQUENCE_MAX)])
+            if ahead:
+                records = [Record(0, row.identity, *each[1:]) for each in ahead]
+                await self._append(records, are_stored=True)
+                _log.warning("%s: %d events that a crash left on a shard are adopted", self.address, len(ahead))
+
+    async def _append(
+        self,
+        records: Sequence[Record],
+        *,
+        witness: tuple[EpisodeId, int] | None = None,
+        numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
+        are_stored: bool = False,
+    ) -> Stored:
+        appending = Appending(
+            self._dialect,
+            records,
+            self.digests,
+            witness=witness,
+            numbers=numbers,
+            restoring=self.blobs.restores,
+            are_stored=are_stored,
+        )
+        if self._write_turn is not None and len(records) >= _MANY_EVENTS:
+            async with self.reading() as connection:
+                await appending.prepare(connection)
+        async with self.writing() as connection:
+            stored = await appending.write(connection)
+        if self.digests is not None and appending.extension is not None:
+            self.digests.keep(appending.extension)
         for episode, removed in appending.discarded.items():
             count = sum(each.episode == episode for each in records)
             self.discarded[removed.id] = self.discarded.get(removed.id, 0) + count

@@ -33,6 +33,7 @@ rate. All readers trust the folders, whose views they read.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from itertools import chain, groupby
@@ -48,12 +49,14 @@ from pycrorm_async import errors
 from pycrorm_async.bulk_records import make
 from pycrorm_async.events import ids
 from pycrorm_async.store import dialect, postgresql_errors, schema
-from pycrorm_async.store.placement import Placement
+from pycrorm_async.store.placement import PLAIN, SHARD_SCHEMA, Placement, Shard
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql_engine import PATH, STRANGER, WARNING
 from pycrorm_async.store.postgresql_engine import TABLES_SCHEMA as TABLES
 from pycrorm_async.store.postgresql_engine import VIEWS_SCHEMA as VIEWS
 from pycrorm_async.store.stored import Span, StoredEvent
+
+_log = logging.getLogger("pycrorm_async")
 
 # === statements ===============================================================================================
 #
@@ -129,9 +132,13 @@ BEGIN
     USING ERRCODE = 'integrity_constraint_violation';
 END $$"""
 
-COUNT_PARTITIONS = f"""
-SELECT pg_catalog.count(*)::int FROM pg_catalog.pg_inherits
-WHERE inhparent = pg_catalog.to_regclass('{LOG}.event')::oid"""
+PARTITIONS = f"""
+SELECT srvoptions FROM pg_catalog.pg_inherits LEFT JOIN pg_catalog.pg_foreign_table ON ftrelid = inhrelid
+LEFT JOIN pg_catalog.pg_foreign_server AS server ON server.oid = ftserver
+WHERE inhparent = pg_catalog.to_regclass('{LOG}.event')::oid
+ORDER BY pg_catalog.length(srvname), srvname"""
+"""Selects, for each partition of the log, the options of the shard that has it; null on this server."""
+HAS_POSTGRES_FDW = "SELECT name FROM pg_catalog.pg_available_extensions WHERE name = 'postgres_fdw'"
 
 _PERMIT_REMOVAL = (
     _REFUSAL.replace("CREATE FUNCTION", "CREATE OR REPLACE FUNCTION"),  # of memories that an earlier version made
@@ -270,7 +277,14 @@ class PostgreSQL(dialect.Dialect):
             connection = await connection.execution_options(isolation_level="AUTOCOMMIT")
             # Also samples the columns again, because statistics have common values of them.
             names = ", ".join([*log, *(f"{TABLES}.{_quote(each)}" for each in tables)])
+            shards = (await self.placement(connection)).shards
+            if shards:
+                names = names.replace(f"{log[0]}, ", "")
             await connection.exec_driver_sql(f"VACUUM (ANALYZE) {names}")
+        if shards:
+            _log.warning(
+                "the shards keep deleted bytes in their pages until `VACUUM %s.event` runs there", SHARD_SCHEMA
+            )
         return None
 
     def completion(self, table: Table, name: str, *, if_missing: bool) -> list[str]:
@@ -288,8 +302,23 @@ class PostgreSQL(dialect.Dialect):
             for effect, change in changes.items()
         ]
 
+    def definition(self, table: Table, placement: Placement = PLAIN, *, if_missing: bool = False) -> list[str]:
+        if table is not schema.EVENT or not placement.shards:
+            return super().definition(table, placement, if_missing=if_missing)
+        kinds = self.syntax.type_compiler_instance
+        columns = ", ".join(f"{each.name} {kinds.process(each.type)} NOT NULL" for each in table.c)
+        name = f"{LOG}.{table.name}"
+        return [
+            *placement.foreign_creation(columns, name, f"{LOG}.refuse_change"),
+            *self.completion(table, name, if_missing=if_missing),
+        ]
+
     async def placement(self, connection: AsyncConnection) -> Placement:
-        return Placement((await connection.exec_driver_sql(COUNT_PARTITIONS)).scalar_one())
+        options = (await connection.exec_driver_sql(PARTITIONS)).scalars().all()
+        if not options or options[0] is None:
+            return Placement(len(options))
+        of_each = (dict(each.split("=", 1) for each in several) for several in options)
+        return Placement(shards=tuple(Shard(each["host"], each["port"], each["dbname"]) for each in of_each))
 
     async def lock_log_changes(self, connection: AsyncConnection, key: int = dialect.LOG_CHANGES) -> None:
         await connection.exec_driver_sql(f"SELECT pg_catalog.pg_advisory_xact_lock({key})")
@@ -509,6 +538,32 @@ async def _driver(connection: AsyncConnection) -> Any:
 def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], ...]:
     """Transpose rows to one array per column, the form in which a statement takes many rows."""
     return tuple([row[column] for row in rows] for column in range(columns))
+
+
+# === shards ===================================================================================================
+
+
+async def make_shard(engine: AsyncEngine, name: str) -> None:
+    """Create the table of events on a shard. Raises `CallerError` if the database is a shard already."""
+    log = _DIALECT.definition(schema.EVENT)
+    # Also the name of the setting that permits a deletion (`placement`).
+    statements = [each.replace(f"{LOG}.", f"{SHARD_SCHEMA}.") for each in (_REFUSAL, *log)]
+    async with engine.begin() as connection:
+        exists = "SELECT pg_catalog.to_regnamespace($1::text) IS NOT NULL"
+        if (await connection.exec_driver_sql(exists, (SHARD_SCHEMA,))).scalar_one():
+            raise errors.CallerError(
+                f"{name} has a schema {SHARD_SCHEMA} already: name another database, or drop the schema if no memory"
+                " keeps events in it"
+            )
+        await _DIALECT.execute_all(connection, [f"CREATE SCHEMA {SHARD_SCHEMA}", *statements])
+
+
+async def needs_shards(engine: AsyncEngine, name: str) -> bool:
+    """Return whether the database holds no log yet. Raises `CallerError` if the server cannot reach others."""
+    async with engine.connect() as connection:
+        if not (await connection.exec_driver_sql(HAS_POSTGRES_FDW)).all():
+            raise errors.CallerError(f"the server of {name} has no postgres_fdw: install PostgreSQL's contrib modules")
+        return await _DIALECT.find_log(connection, name) is None
 
 
 # === roles ====================================================================================================

@@ -49,6 +49,7 @@ NOT_RUN: Final = {
     "pip install datasette": "installs; `test_row_exports.py` compares the metadata with the tables",
     "datasette -i": "needs Datasette",
     'robot = "tiago"': "a map file; `test_bags.py` reads it",
+    "pycrorm init --shard": "needs further servers; `test_shards.py` creates such a memory",
     "ssh -L": "needs a second computer",
     "[Service]": "needs systemd; `test_pages.py` looks up the command that it starts",
     '{\n  "mcpServers"': "names a folder of the reader's; `test_mcp_server.py` starts the same command",
