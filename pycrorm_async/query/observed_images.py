@@ -34,6 +34,8 @@ _PIXELS_MAX: Final = 50_000_000
 _HEADER_MAX: Final = 4_096
 """Bounds the header of a PCD file."""
 _POINTS_MAX: Final = 20_000_000
+_FARTHEST_M: Final = 1e6
+"""Points that are farther from the origin along an axis are left out, because 32 bits hold no millimetres there."""
 _CHANNELS: Final = {1: 0, 3: 2, 4: 6}
 """PNG's colour types by the number of channels."""
 _VIRIDIS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
@@ -81,11 +83,12 @@ def _kind_of(shape: tuple[int, ...], dtype: str) -> Kind | None:
 def contents_in(values: Any, path: str = "", around: Mapping[str, Any] | None = None) -> Iterator[Content]:
     """Yield the contents that the values of an observation refer to."""
     if isinstance(values, Mapping):
-        if isinstance(name := values.get(BLOB_KEY), str):
-            shape, dtype = values.get("shape"), values.get("dtype")
-            described = None if shape is None else tuple(map(int, shape))
-            yield Content(path, name, str(values["media_type"]), int(values["size"]), described, dtype, around or {})
-            return
+        match values:
+            case {"$blob": str() as name, "media_type": str() as media_type, "size": int() as size}:
+                shape, dtype = values.get("shape"), values.get("dtype")
+                described = tuple(map(int, shape)) if shape else None
+                yield Content(path, name, media_type, size, described, dtype, around or {})
+                return
         for key, each in values.items():
             yield from contents_in(each, f"{path}.{key}" if path else key, values)
     elif isinstance(values, list):
@@ -226,7 +229,7 @@ def points_of(content: Content, data: bytes) -> NDArray[np.float32]:
             axis = np.array([x, y, z], float)
             turned = np.cross(axis, points)
             points = points + 2 * (w * turned + np.cross(axis, turned)) + np.array(position, float)
-    return points.astype(np.float32)
+    return points[(np.abs(points) < _FARTHEST_M).all(axis=1)].astype(np.float32)
 
 
 def _pcd(data: bytes) -> NDArray[Any]:

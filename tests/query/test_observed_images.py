@@ -25,7 +25,7 @@ from pycrorm_async.query.observed_images import (
 )
 from pycrorm_async.record.values import NPY
 
-POINTS = np.array([[1, 2, 3], [np.nan, 0, 0], [-1, 0.5, 4]], np.float32)
+POINTS = np.array([[1, 2, 3], [np.nan, 0, 0], [1e30, 0, 0], [-1, 0.5, 4]], np.float32)
 
 
 def npy(array: NDArray[Any]) -> bytes:
@@ -46,9 +46,9 @@ def content_of(values: Any) -> Content:
 
 def pcd(form: str, body: bytes) -> bytes:
     header = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\n"
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\n"
     )
-    return f"{header}POINTS 3\nDATA {form}\n".encode() + body
+    return f"{header}POINTS 4\nDATA {form}\n".encode() + body
 
 
 @pytest.mark.parametrize(
@@ -82,6 +82,11 @@ def test_a_png_has_the_pixels_and_a_depth_map_its_colours() -> None:
     assert smaller(np.zeros((480, 641, 3), np.uint8), 320).shape == (160, 214, 3)
 
 
+def test_a_dict_that_only_looks_like_a_reference_is_none() -> None:
+    assert list(contents_in({BLOB_KEY: "x", "size": 3})) == []
+    assert list(contents_in([{BLOB_KEY: 1}, {"a": {BLOB_KEY: None, "media_type": "image/png", "size": 1}}])) == []
+
+
 def test_pixels_of_bgr_are_turned_to_rgb() -> None:
     image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
     content = content_of({"encoding": "bgr8", "image": reference(NPY, image)})
@@ -113,7 +118,7 @@ def test_points_of_an_array_and_of_pcd_files_are_the_same_and_are_placed_by_a_po
         pcd("binary", b""),
         b"POINTS 3",
         b"\nDATA ascii\n",
-        pcd("ascii", b"").replace(b"POINTS 3", b"POINTS 99999999999"),
+        pcd("ascii", b"").replace(b"POINTS 4", b"POINTS 99999999999"),
         pcd("binary", b"").replace(b"SIZE 4 4 4 4", b"SIZE 4 4 4 9"),
         pcd("ascii", b"").replace(b"FIELDS rgb x y z", b"FIELDS a b c d"),
     ],
