@@ -8,6 +8,7 @@ const LISTED_MAX = 200;
 const MESSAGES_MAX = 5;
 const LINKS_MAX = 12;
 const VALUE_MAX = 60;
+const CONTENT = /\{"\$blob":"[^"]*","media_type":"([^"]*)","size":(\d+)[^{}]*\}/g;
 
 const listOf = (facts) => element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
 
@@ -275,7 +276,7 @@ export class Panels {
 
   #observations() {
     const row = ({ at, name, values, node }) =>
-      element("p", {}, this.#moment(at), " ", recorded(name, { class: "name" }), " ", recorded(values), " ", this.#node(node));
+      element("p", {}, this.#moment(at), " ", recorded(name, { class: "name" }), " ", recorded(values.replace(CONTENT, "$1 of $2 bytes")), " ", this.#node(node));
     return this.#around(this.episode.observations, row, this.episode.unlisted.observations);
   }
 
