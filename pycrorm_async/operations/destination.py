@@ -21,6 +21,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from functools import partial
@@ -31,9 +32,11 @@ from typing import Final, NamedTuple
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.projections.custom import Projection, installed_projections
+from pycrorm_async.projections.fold_group import FoldGroup
 from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, WHOLE
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.blobs import read_blob
 from pycrorm_async.queue.format import map_segment, salt_of, segment_numbers, segment_path
@@ -45,6 +48,7 @@ from pycrorm_async.queue.stored_segments import EpisodeNumbers, kept_segments, s
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.schema import SELECT_BEHIND, SELECT_STOPPED
 from pycrorm_async.store.stored import EpisodeRow
 
 _APPENDS_AT_ONCE = 4
@@ -53,6 +57,9 @@ _APPENDS_AT_ONCE = 4
 
 _WATCH_S = 1.0
 """The interval between two checks that a SQLite file still exists; a check takes two microseconds."""
+
+_OTHERS_S: Final = 1.0
+"""The time for which a process that wants all events folded waits for others to fold some of their shares."""
 
 _log = logging.getLogger("pycrorm_async")
 _HEADS_MAX: Final = 64
@@ -73,6 +80,7 @@ class LogAndTables:
     def __init__(self, log: EventLog, projector: Projector, spool: Path | None = None) -> None:
         self.log = log
         self.log_id = log.log_id
+        self.group = FoldGroup(log)
         self._projector = projector
         self._spool = spool
         self._refused = False
@@ -193,13 +201,45 @@ class LogAndTables:
 
     # --- the tables -------------------------------------------------------------------------------------------
 
+    @property
+    def has_other_writers(self) -> bool:
+        return not self.log.address.is_sqlite
+
     async def fold(self) -> int:
+        """Fold everything in the log, of a large backlog by share first; return the number of events folded here."""
         async with self._tables():
-            return await self._projector.catch_up()
+            count = 0
+            if self.has_other_writers and await self._projector.size() >= LOOKAHEAD_EVENTS_MIN:
+                count = await self._fold_by_share()
+            return count + await self._projector.catch_up()
+
+    async def _fold_by_share(self) -> int:
+        """Fold this process' share, and wait for the others to fold theirs; stop when none of them has for a while."""
+        count, moved_s = 0, time.monotonic()
+        behind: Mapping[str, int] = {}
+        try:
+            while True:
+                async with self.group.folding() as share:
+                    folded = await self._projector.fold_tables(share)
+                if folded is not None:
+                    count, moved_s = count + folded, time.monotonic()
+                    continue
+                before, behind = behind, await self.behind()
+                moved_s = time.monotonic() if before != behind else moved_s
+                if not behind or time.monotonic() > moved_s + _OTHERS_S:
+                    return count
+                await asyncio.sleep(_OTHERS_S / 10)
+        finally:
+            await self.group.leave()
 
     async def fold_next_batch(self) -> bool:
-        async with self._tables():
-            return await self._projector.fold_next_batch()
+        async with self.group.folding() as share, self._tables():
+            return await self._projector.fold_next_batch(share)
+
+    async def has_unfolded(self) -> bool:
+        share = await self.group.share()
+        some = await self.group.read(EpisodeRow, SELECT_BEHIND, after=0, limit=1, **share._asdict())
+        return bool(some) or await self.group.is_stalled()
 
     @asynccontextmanager
     async def _tables(self) -> AsyncIterator[None]:
@@ -214,10 +254,12 @@ class LogAndTables:
             raise
 
     async def behind(self) -> Mapping[str, int]:
-        return {each.id: each.folded for each in await self.log.behind()}
+        behind = await self.group.read(EpisodeRow, SELECT_BEHIND, after=0, limit=EPISODE_NUMBER_MAX, **WHOLE._asdict())
+        return {each.id: each.folded for each in behind}
 
     async def stopped(self) -> Mapping[str, str]:
-        return {each.id: each.refused or each.parked or "" for each in await self.log.stopped()}
+        stopped = await self.group.read(EpisodeRow, SELECT_STOPPED)
+        return {each.id: each.refused or each.parked or "" for each in stopped}
 
 
 def _latest(heads: Mapping[EpisodeId, int]) -> dict[EpisodeId, int]:
@@ -254,8 +296,11 @@ async def open_destination(
         keeps = settings.keep_stored_s and settings.keep_stored_bytes
         kept = spool.path if keeps and stored_in(spool.path, log.log_id) else None
         destination = LogAndTables(log, projector, kept)
-        await destination.open_tables()
-        yield destination
+        try:
+            await destination.open_tables()
+            yield destination
+        finally:
+            await destination.group.leave()
     finally:
         watching.cancel()
         await log.close()

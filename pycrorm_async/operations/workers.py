@@ -163,9 +163,9 @@ class FoldWorker:
         self._change(batches=self.state.batches + (count > 0))
         return count
 
-    async def fold_rest(self, *, now: bool) -> bool:
+    async def fold_rest(self, share: Share, *, now: bool) -> bool:
         """Refresh materialised views and fold custom projections by one step; return False if none was behind."""
-        return bool(await self._request(FoldRest(now)))
+        return bool(await self._request(FoldRest(share, now)))
 
     async def fold_share(self, share: Share) -> int | None:
         """Fold a batch of this share of a rebuild; return the number of its events, None when none is left."""
@@ -288,8 +288,9 @@ class Write(NamedTuple):
 
 
 class FoldRest(NamedTuple):
-    """Bring views and projections up to date; answered with whether there was anything to do."""
+    """Bring views, and projections of this share, up to date; answered with whether there was anything to do."""
 
+    share: Share
     now: bool
 
 
@@ -350,8 +351,8 @@ class _RequestHandler:
                 return await (await self._opened(self._log)).runner.prepare(spans)
             case Write():
                 return await (await self._opened(self._log)).runner.write()
-            case FoldRest(now):
-                return await (await self._opened(self._log)).fold_rest(now=now)
+            case FoldRest(share, now):
+                return await (await self._opened(self._log)).fold_rest(now=now, share=share)
             case FoldShare(share):
                 if self._rebuild is None:
                     self._rebuild = await Rebuild.join(self._log, share)
@@ -610,21 +611,34 @@ class FoldWorkerTables(TablesPort):
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:
         self._destination = destination
         self._workers = workers
-        self._runner = FoldRunner(LiveTarget(destination.log))
+        self._target = LiveTarget(destination.log)
+        self._runner = FoldRunner(self._target)
         self._has_news = True
 
+    @property
+    def has_other_writers(self) -> bool:
+        return self._destination.has_other_writers
+
+    async def has_unfolded(self) -> bool:
+        return await self._destination.has_unfolded()
+
     async def fold_next_batch(self) -> bool:
-        if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
-            self._workers.want(await self._runner.size())
-        workers = self._workers.ready
-        if not workers:
-            folded = await self._destination.fold_next_batch()
-            if folded:
-                self._workers.want(events=1)
-            return folded
+        async with self._destination.group.folding() as share:
+            self._target.share = share
+            if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
+                self._workers.want(await self._runner.size())
+            workers = self._workers.ready
+            if workers:
+                return await self._fold_with(workers, share)
+        folded = await self._destination.fold_next_batch()
+        if folded:
+            self._workers.want(events=1)
+        return folded
+
+    async def _fold_with(self, workers: Sequence[FoldWorker], share: Share) -> bool:
         try:
             count = await self._runner.fold_next(workers)
-            self._has_news = count is not None or await workers[0].fold_rest(now=self._has_news)
+            self._has_news = count is not None or await workers[0].fold_rest(share, now=self._has_news)
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
         return self._has_news

@@ -22,6 +22,7 @@ from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections import pipeline as checkpoints
 from pycrorm_async.projections.columns import OWN, Layout, Storage, next_number
 from pycrorm_async.projections.custom import CustomRows, EpisodeFolds, PackedProjection, Projection, columns_of
+from pycrorm_async.projections.fold_group import OtherShares
 from pycrorm_async.projections.generations import (
     PROJECTION,
     Generation,
@@ -33,12 +34,22 @@ from pycrorm_async.projections.generations import (
     write_generation,
 )
 from pycrorm_async.projections.mapped_tables import with_user_views
-from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, Batch, FoldRunner, Learn, SideTarget
+from pycrorm_async.projections.pipeline import (
+    LOOKAHEAD_EVENTS_MIN,
+    WHOLE,
+    Batch,
+    FoldRunner,
+    Learn,
+    Share,
+    SideTarget,
+)
 from pycrorm_async.store.log import EventLog
 
 _log = logging.getLogger("pycrorm_async.projections")
 _CHECK_S = 1.0
 """The interval between checks for events from other processes."""
+_COMPARED_MAX = 1_000
+"""Bounds the episodes that are compared to find a share that no process folds."""
 _SCAN_SHARE_MAX = 0.02
 """Bounds the share of time in which all episodes are checked, and not the newest only: 100,000 take 25 ms."""
 _SCAN_S_MAX = 10.0
@@ -155,6 +166,15 @@ class _CustomFold(NamedTuple):
     projection: Projection
     target: SideTarget
     runner: FoldRunner
+    others: OtherShares
+
+    async def share(self, own: Share, *, may_compare: bool) -> Share:
+        """Return the share to fold: the own one, or all of them while one of the others is not folded."""
+        if own == WHOLE or not (may_compare and self.others.is_due):
+            return self.others.folded_with(own)
+        self.target.share = WHOLE
+        async with self.target.log.reading() as connection:
+            return self.others.compare(await self.target.behind(connection, 0, _COMPARED_MAX), own)
 
 
 class CustomTables:
@@ -189,7 +209,7 @@ class CustomTables:
             target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
             batch_events = events_of_batch(each, self._batch_events)
             runner = FoldRunner(target, learner_of(each), batch_events=batch_events)
-            self._folds.append(_CustomFold(each, target, runner))
+            self._folds.append(_CustomFold(each, target, runner, OtherShares()))
         return changed
 
     def companions(self, events: int, *, until_visible: bool) -> list[FoldRunner]:
@@ -201,8 +221,10 @@ class CustomTables:
         packed = until_visible or events >= LOOKAHEAD_EVENTS_MIN
         return [each.runner for each in self._folds if packed or not each.projection.is_packed]
 
-    async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
-        """Fold a batch of each projection; return False if none was behind.
+    async def fold_next_batch(self, *, now: bool, until_visible: bool = False, share: Share = WHOLE) -> bool:
+        """Fold a batch of this share of each projection; return False if none was behind.
+
+        Shares that no process folds are folded too, because the process of another share may not have the code.
 
         Checks only every `_CHECK_S` unless `now` is True, and then the newest episodes only, because older ones rarely
         get events; all of them in some of the checks, and if `until_visible` is True. The package's own projections are
@@ -217,11 +239,12 @@ class CustomTables:
         packed = is_scan or time_s >= self._packed_s + _CHECK_S
         count = most_events = 0
         for fold in [each for each in self._folds if packed or not each.projection.is_packed]:
-            projection, target, runner = fold
+            projection, target, runner, _ = fold
             if is_scan and target.newest_only:
                 runner.last_number = 0  # begin with the oldest, which have waited
             target.newest_only = not is_scan
             try:
+                target.share = await fold.share(share, may_compare=is_scan)
                 events = await runner.fold_next()
                 count += events is not None
                 most_events = max(most_events, events or 0)

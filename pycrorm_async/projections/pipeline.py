@@ -615,7 +615,7 @@ _NEWEST = text("SELECT coalesce(max(number), 0) FROM episode")
 
 
 class Share(NamedTuple):
-    """The episodes that one of several workers folds: those whose number modulo `many` is `part`."""
+    """The episodes that one of several processes folds: those whose number modulo `many` is `part`."""
 
     part: int = 0
     many: int = 1
@@ -647,14 +647,20 @@ class FoldTarget(generations.GrowthTarget, Protocol):
 
 
 class LiveTarget:
-    """The visible generation, with `episode.folded` as its checkpoints. Implements `FoldTarget`."""
+    """The visible generation, with `episode.folded` as its checkpoints. Implements `FoldTarget`.
+
+    Attributes:
+        share: the episodes that this process folds.
+    """
 
     def __init__(self, log: EventLog) -> None:
         self.log = log
+        self.share = WHOLE
         self._known: generations.Generation | None = None
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
-        return await dialect_of(connection).rows(connection, EpisodeRow, SELECT_BEHIND, after=after, limit=limit)
+        values = {"after": after, "limit": limit, **self.share._asdict()}
+        return await dialect_of(connection).rows(connection, EpisodeRow, SELECT_BEHIND, **values)
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
         if steps and not await advance_folded(connection, steps):
@@ -689,10 +695,10 @@ class SideTarget:
         projection: the custom projection's name; None for the built-in tables.
         version: of the fold in this process.
         number: of the generation; None accepts any that has the key.
-        share: the episodes that this process folds.
 
     Attributes:
         newest_only: whether `behind` leaves out all but the newest episodes.
+        share: the episodes that this process folds.
     """
 
     def __init__(
@@ -711,7 +717,7 @@ class SideTarget:
         self._projection = projection
         self._version = version
         self._number = number
-        self._share = share
+        self.share = share
         self._place = ""
         self._known: generations.Generation | None = None
 
@@ -725,7 +731,7 @@ class SideTarget:
             self._place,
             after=after,
             limit=min(limit, _BEHIND_EPISODES_MAX),
-            share=self._share,
+            share=self.share,
             after_tables=self._projection is not None,
         )
 

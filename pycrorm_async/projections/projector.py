@@ -19,7 +19,7 @@ from pycrorm_async.projections.columns import next_number
 from pycrorm_async.projections.custom import Projection
 from pycrorm_async.projections.custom_tables import CustomTables
 from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
-from pycrorm_async.projections.pipeline import FoldRunner, LiveTarget, sweep
+from pycrorm_async.projections.pipeline import WHOLE, FoldRunner, LiveTarget, Share, sweep
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
@@ -98,6 +98,7 @@ class Projector:
         count = 0
         with self._log.translated():
             self._until_visible = True
+            self._target.share = WHOLE
             try:
                 while (folded := await self.runner.fold_next()) is not None:
                     count += folded
@@ -109,18 +110,31 @@ class Projector:
                 pass
         return count
 
-    async def fold_next_batch(self) -> bool:
-        """Fold one batch, or do one step of `fold_rest`; return False if nothing was behind the log."""
-        self._has_news = await self.runner.fold_next() is not None or await self.fold_rest(now=self._has_news)
+    async def fold_next_batch(self, share: Share = WHOLE) -> bool:
+        """Fold one batch of a share, or do one step of `fold_rest`; return False if nothing was behind the log."""
+        self._has_news = await self.fold_tables(share) is not None or await self.fold_rest(
+            now=self._has_news, share=share
+        )
         return self._has_news
 
-    async def fold_rest(self, *, now: bool) -> bool:
+    async def fold_tables(self, share: Share) -> int | None:
+        """Fold one batch of a share into the built-in tables; return as `FoldRunner.fold_next` does."""
+        self._target.share = share
+        return await self.runner.fold_next()
+
+    async def size(self) -> int:
+        """Return the number of events that the next batch of all shares would have."""
+        self._target.share = WHOLE
+        return await self.runner.size()
+
+    async def fold_rest(self, *, now: bool, share: Share = WHOLE) -> bool:
         """Refresh some rows of the materialised views or fold custom projections; return False if none was behind.
 
-        Unless `now` is true, custom projections are checked at intervals only.
+        Unless `now` is true, custom projections are checked at intervals only. Of other shares than this one they are
+        folded seldom, because another process does that if it has their code.
         """
         with self._log.translated():
-            return await self._refresh() or await self._custom.fold_next_batch(now=now)
+            return await self._refresh() or await self._custom.fold_next_batch(now=now, share=share)
 
     def _companions(self, events: int) -> Sequence[FoldRunner]:
         return self._custom.companions(events, until_visible=self._until_visible)

@@ -40,6 +40,8 @@ LOG_CHANGES = 7266203370152417861
 """Key of the lock that creations and migrations of a log, and changes of its tables, take. It encodes our name."""
 DECLARATIONS = LOG_CHANGES + 2
 """Key of the lock that transactions with new declarations take."""
+FOLDING = LOG_CHANGES + 3
+"""Key of the lock that every session shares whose process folds by share (`projections.fold_group`)."""
 
 
 MADE = re.compile(r"__\d+$")
@@ -267,6 +269,10 @@ class Dialect(ABC):
 
         Returns False if one is missing; the caller must not use the transaction any more then.
         """
+
+    async def join_fold_group(self, connection: AsyncConnection) -> tuple[int, int]:  # noqa: ARG002
+        """Join the sessions of those that fold this memory; return the place among them, from 0, and their number."""
+        return 0, 1
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:  # noqa: ARG002
         """Return the errors that the database finds in its own pages, if it can check them."""

@@ -343,7 +343,7 @@ class EventLog:
 
     async def behind(self, after: int = 0, limit: int = EPISODE_NUMBER_MAX) -> list[EpisodeRow]:
         """Read the episodes with unfolded events whose number is above `after`, by number, without parked ones."""
-        return await self.read(EpisodeRow, schema.SELECT_BEHIND, after=after, limit=limit)
+        return await self.read(EpisodeRow, schema.SELECT_BEHIND, after=after, limit=limit, part=0, many=1)
 
     async def stopped(self) -> list[EpisodeRow]:
         """Read the refused and parked episodes; the rows hold the reasons."""

@@ -69,6 +69,14 @@ SYSTEM_COLUMNS = frozenset("xmin xmax cmin cmax ctid tableoid".split())
 CLAIM = f"SELECT pg_catalog.pg_try_advisory_lock({dialect.LOG_CHANGES + 1})"
 RELEASE = f"SELECT pg_catalog.pg_advisory_unlock({dialect.LOG_CHANGES + 1})"
 
+JOIN_FOLDING = f"SELECT pg_catalog.pg_advisory_lock_shared({dialect.FOLDING})"
+PLACE_IN_FOLDING = f"""
+SELECT count(*) FILTER (WHERE pid < pg_catalog.pg_backend_pid()), count(*),
+count(*) FILTER (WHERE pid = pg_catalog.pg_backend_pid())
+FROM pg_catalog.pg_locks WHERE locktype = 'advisory' AND granted AND objsubid = 1
+AND (classid::bigint << 32 | objid::bigint) = {dialect.FOLDING}
+AND database = (SELECT oid FROM pg_catalog.pg_database WHERE datname = pg_catalog.current_database())"""
+
 # Less than deadlock_timeout, so that the session that changes tables fails, never a reader.
 WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
 WAIT_FOR_NOBODY = "SET LOCAL lock_timeout = '20ms'"
@@ -389,6 +397,13 @@ class PostgreSQL(dialect.Dialect):
                 return False
             raise
         return True
+
+    async def join_fold_group(self, connection: AsyncConnection) -> tuple[int, int]:
+        place, count, is_member = tuple((await connection.exec_driver_sql(PLACE_IN_FOLDING)).one())
+        if not is_member:
+            await connection.exec_driver_sql(JOIN_FOLDING)
+            place, count, _ = tuple((await connection.exec_driver_sql(PLACE_IN_FOLDING)).one())
+        return place, count
 
     # --- tables and views ---------------------------------------------------------------------------------------
 

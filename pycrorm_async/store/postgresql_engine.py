@@ -92,7 +92,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
             # A cached plan fails once after its view gets a column, which happens with every new type.
             "prepared_statement_cache_size": 0,
         },
-        pool_size=2,
+        pool_size=3,  # of a daemon: one appends, one folds, and one is in the fold group
         pool_pre_ping=True,
         hide_parameters=True,
     )

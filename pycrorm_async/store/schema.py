@@ -290,7 +290,10 @@ LOCK_EPISODES_AND_READ_WITNESS: Final = sql.union_all(
 SELECT_EPISODES: Final = _in_order.where(EPISODE.c.number.between(bindparam("first"), bindparam("last"))).limit(
     bindparam("limit")
 )
-SELECT_BEHIND: Final = _in_order.where(_IS_BEHIND, EPISODE.c.number > bindparam("after")).limit(bindparam("limit"))
+_is_in_share = EPISODE.c.number % bindparam("many") == bindparam("part")
+SELECT_BEHIND: Final = _in_order.where(_IS_BEHIND, EPISODE.c.number > bindparam("after"), _is_in_share).limit(
+    bindparam("limit")
+)
 SELECT_STOPPED: Final = _in_order.where(_IS_STOPPED)
 SELECT_LONG: Final = _in_order.where(EPISODE.c.head >= bindparam("events_min"), EPISODE.c.ended_wall_ns.is_(None))
 _is_numbered = _is_among(EPISODE.c.number, "numbers")

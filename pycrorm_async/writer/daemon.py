@@ -2,8 +2,10 @@
 
 **Theory of operation.** All tasks run in one loop and one task group. The scan loop in `run` claims every folder that
 can be drained and starts a drain task for it (`_serve`). The fold task folds whenever a drain has appended, and
-publishes to each recorder how far its events are visible. The confirm task asks the database every few seconds whether
-it still holds the last stored events, so that a log that went back is refilled even while no recorder appends.
+publishes to each recorder how far its events are visible. On a server it also looks at intervals for events that other
+processes appended or folded, because the processes that fold one memory share its episodes. The confirm task asks the
+database every few seconds whether it still holds the last stored events, so that a log that went back is refilled even
+while no recorder appends.
 
 A recorder's name is in `_serving` from its claim to the release of its folder, and in `_rests` while a failed folder
 waits for its next attempt. The scan excludes both, so each folder has at most one drain task. Processes exclude each
@@ -41,6 +43,9 @@ _SCAN_INTERVAL_S: Final = 0.2
 """Interval between two scans for folders, and so the delay until a new recorder is drained."""
 _CONFIRM_S: Final = 5.0
 """Interval at which the database confirms the last stored events: one row, in a tenth of a millisecond."""
+_LOOK_S: Final = (0.05, 0.5)
+"""The shortest and longest interval between two looks for what other processes appended or folded: a tenth of the time
+since there was anything to do. A look costs half a millisecond."""
 _REST = drain.Backoff(first_s=1.0, longest_s=60.0)
 """Pauses before the next attempt at a folder that could not be drained: a damaged one, or one without dead letters."""
 
@@ -209,11 +214,18 @@ class Daemon:
     async def _fold_repeatedly(self) -> None:
         self._appended_events.set()  # an earlier process may have left events unfolded
         attempt = 0
+        busy_s = self._now_s()
         while True:
-            await self._appended_events.wait()
-            self._appended_events.clear()
+            if self._tables.has_other_writers:
+                await _wait(self._appended_events, min(max(_LOOK_S[0], (self._now_s() - busy_s) / 10), _LOOK_S[1]))
+            else:
+                await self._appended_events.wait()
             try:
-                more = True
+                more = self._appended_events.is_set() or await self._availability.observe(self._tables.has_unfolded())
+                self._appended_events.clear()
+                busy_s = self._now_s() if more else busy_s
+                if not more:
+                    await self._publish_visibility()  # of what other processes folded
                 while more:
                     more = await self._availability.observe(self._tables.fold_next_batch())
                     self._publish_pending(None)
@@ -242,6 +254,8 @@ class Daemon:
             await asyncio.sleep(_CONFIRM_S)
 
     async def _publish_visibility(self) -> None:
+        if not any(each.has_invisible for each in self._serving.values()):
+            return
         before = {each: each.drain.state.appended for each in self._serving.values()}
         behind = await self._availability.observe(self._tables.behind())
         stopped = await self._availability.observe(self._tables.stopped())
@@ -376,6 +390,11 @@ class VisibilityTracker:
         self._stopped: dict[str, str] = {}
         self._updated = asyncio.Event()
         self._is_pending = False
+
+    @property
+    def has_invisible(self) -> bool:
+        """Whether appended records are not published as visible yet."""
+        return bool(self._invisible)
 
     async def run(self) -> None:
         """Run until the folder is drained and all its records are visible, or the tables wait for a rebuild.

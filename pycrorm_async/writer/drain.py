@@ -344,6 +344,15 @@ class Destination(Log, Protocol):
 class TablesPort(Protocol):
     """The tables behind a log, for a daemon that folds in steps while it appends."""
 
+    @property
+    def has_other_writers(self) -> bool:
+        """Whether other processes may append and fold events at the same time, so that it has to look for them."""
+        ...
+
+    async def has_unfolded(self) -> bool:
+        """Return whether events that this process should fold are not visible yet. Raises `DatabaseUnavailable`."""
+        ...
+
     async def fold_next_batch(self) -> bool:
         """Fold one batch of events that are not visible yet; False if there was none.
 
