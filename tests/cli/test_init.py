@@ -27,6 +27,7 @@ from tests.table_comparison import differences, tables_of
 pytestmark = pytest.mark.slow
 
 PARTITIONS = 3
+PLACED = {"partitions": PARTITIONS, "shards": []}
 WHOLE = """SELECT relname FROM pg_class WHERE relkind = 'r' AND NOT relispartition
 AND relnamespace IN ('pycrorm'::regnamespace, 'memory_tables'::regnamespace) ORDER BY relname"""
 PARTS = """SELECT inhparent::regclass::text, count(*) FROM pg_inherits JOIN pg_class ON oid = inhrelid
@@ -63,7 +64,7 @@ async def test_partitions_are_kept_by_new_types_views_rebuilds_copies_and_restor
 ) -> None:
     url, copied, restored = server.new_database(), server.new_database(), server.new_database()
     document = answer("init", "--partitions", str(PARTITIONS), "--url", url, cwd=tmp_path)
-    assert document == {"url": DatabaseAddress.parse(url).to_type, "placement": {"partitions": PARTITIONS}}
+    assert document == {"url": DatabaseAddress.parse(url).to_type, "placement": PLACED}
     assert_partitioned(url)
     await append_and_fold(url, [*TYPES, *(each for number in range(1, 8) for each in picking(number).records)])
     await append_and_fold(url, whispering(8))
@@ -86,8 +87,8 @@ async def test_partitions_are_kept_by_new_types_views_rebuilds_copies_and_restor
     assert_partitioned(restored, "zz_whispering_action")
     assert differences(before, tables_of(restored)) == []
     assert pycrorm("verify", "--url", restored, cwd=tmp_path).returncode == 0
-    assert answer("status", "--url", restored, cwd=tmp_path)["placement"] == {"partitions": PARTITIONS}
-    assert f"have {PARTITIONS} partitions by episode" in pycrorm("status", "--url", restored, cwd=tmp_path).stdout
+    assert answer("status", "--url", restored, cwd=tmp_path)["placement"] == PLACED
+    assert f"memory: {PARTITIONS} partitions by episode" in pycrorm("status", "--url", restored, cwd=tmp_path).stdout
 
 
 async def test_the_rows_of_a_materialised_view_are_partitioned(server: Server, tmp_path: Path) -> None:
@@ -126,8 +127,8 @@ def test_what_cannot_be_partitioned_is_refused_in_one_line(server: Server, tmp_p
     for words, line in (
         (("--partitions", "4", "--url", "sqlite:///new.db"), "has no partitions: name a PostgreSQL database"),
         (("--partitions", "4", "--url", url), "is a memory already, with"),
-        (("--partitions", "1", "--url", url), "from 2 to 16 partitions, not 1"),
-        (("--partitions", "17", "--url", url), "from 2 to 16 partitions, not 17"),
+        (("--partitions", "1", "--url", url), "from 2 to 16 partitions, or up to 16 shards, not 1"),
+        (("--partitions", "17", "--url", url), "up to 16 shards, not 17"),
     ):
         done = pycrorm("init", *words, cwd=tmp_path)
         assert (done.returncode, line in one_line_of(done)) == (2, True), done.stderr
