@@ -259,14 +259,14 @@ class NodeEvents:
 
     def __init__(self, events: EpisodeEvents, *, simulated: bool) -> None:
         self.root = 0
-        self._events = events
+        self._put, self._emitter = events.put, events.emitter
         self._simulated = simulated
         self._open: dict[int, str] = {}
         self._ending: set[int] = set()
 
     def start_root(self) -> None:
         """Write the start of the root."""
-        self.root = self._events.put(event_types.NodeStarted("root", simulated=self._simulated))
+        self.root = self._put(event_types.NodeStarted("root", simulated=self._simulated))
         self._open[self.root] = "Episode"
 
     def start(
@@ -286,7 +286,7 @@ class NodeEvents:
         `whole` are the parameters for observers, with the poses that `parameters` names in nodes around. Raises
         `Unrecordable` if `may_refuse` and the settings ask for it.
         """
-        owner, emitter = declared.dtype, self._events.emitter
+        owner, emitter = declared.dtype, self._emitter
         if missing:
             emitter.note_missing(owner, missing, may_refuse=may_refuse)
         written = cast("event_types.RobotValue", robot.written) if robot is not None else None
@@ -298,7 +298,7 @@ class NodeEvents:
             shown = {} if robot is None else {"robot": robot.state}
             if whole is not None:
                 shown["parameters"] = whole
-        sequence = self._events.put(event, owner, may_refuse=may_refuse, shown=shown)
+        sequence = self._put(event, owner, may_refuse=may_refuse, shown=shown)
         self._open[sequence] = owner
         return sequence
 
@@ -320,8 +320,8 @@ class NodeEvents:
                     parts = {"failure": failure.arguments if failure is not None else None, "result": result}
                     for name, value in parts.items():
                         for each in live_values.missing_in(value):
-                            self._events.emitter.missing.note(owner, name, each.missing)
-                self._events.put(event_types.NodeEnded(node, status, failure, result, untimed), owner)
+                            self._emitter.missing.note(owner, name, each.missing)
+                self._put(event_types.NodeEnded(node, status, failure, result, untimed), owner)
         finally:
             self._ending.discard(node)
 

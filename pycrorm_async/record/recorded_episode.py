@@ -120,8 +120,9 @@ class RecordedEpisode:
 
     @property
     def refusal(self) -> str | None:
-        """Why nothing, or nothing more, is recorded: the log cannot be read, or has other events of this name, or the
-        episode is open; None without a reason.
+        """The reason why nothing, or nothing more, is recorded; None while the episode is recorded.
+
+        The log cannot be read, or has other events of this name, or the episode is open.
         """
         return self._writer.refusal
 
