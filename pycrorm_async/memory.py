@@ -434,6 +434,7 @@ class Memory:
     as_of = _reading(lambda: reading_side.Reading.as_of)
     diff = _reading(lambda: reading_side.Reading.diff)
     blob = _reading(lambda: reading_side.Reading.blob)
+    lake = _reading(lambda: reading_side.Reading.lake)
     number_of = _reading(lambda: reading_side.Reading.number_of)
     plot_success = _reading(lambda: reading_side.plot_success)
     samples = _reading(lambda: reading_side.read_samples)

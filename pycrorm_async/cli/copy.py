@@ -15,6 +15,7 @@ from pycrorm_async.cli.output import Form, print_rows, problem
 from pycrorm_async.cli.reading import DEFAULT_URL, Place, SpoolOption
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.progress_bar import progress_bar
+from pycrorm_async.store.lake import PREFIX
 
 
 def copy(
@@ -23,7 +24,7 @@ def copy(
     source: Annotated[
         str,
         typer.Option(
-            "--from", envvar="PYCRORM_URL", metavar="URL", help="Memory to copy; only read.", show_envvar=True
+            "--from", envvar="PYCRORM_URL", metavar="URL", help="Memory, or lake, to copy; only read.", show_envvar=True
         ),
     ] = DEFAULT_URL,
     episode: Annotated[
@@ -43,7 +44,8 @@ def copy(
     """
     collect_seldom()
     summary = asyncio.run(_copy(source, target, episode or []))
-    Place(source, spool).note_pending_events()
+    if not source.startswith(PREFIX):
+        Place(source, spool).note_pending_events()
     print_rows(
         form,
         summary,

@@ -39,6 +39,8 @@ def episodes(
     choice = chosen.choice(None if every else _LISTED)
 
     async def read(reading: Reading) -> tuple[list[EpisodeSummary], int, str]:
+        if removed := len(await (await reading.log()).all_removed()):
+            output.note(f"{output.counted(removed, 'episode')} archived or erased: `pycrorm erase` lists them")
         listed = await reading.episodes(choice, simulated=simulated)
         if len(listed) != choice.limit:
             return listed, len(listed), "" if listed else await absence_of_episodes(reading, choice)

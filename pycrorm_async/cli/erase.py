@@ -13,7 +13,17 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import Form, TagOption, counted, moment, note, parse_since, print_rows, problem
+from pycrorm_async.cli.output import (
+    Form,
+    LakeOption,
+    TagOption,
+    counted,
+    moment,
+    note,
+    parse_since,
+    print_rows,
+    problem,
+)
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations import removal
@@ -37,6 +47,7 @@ def erase(
     tag: TagOption = None,
     reason: Annotated[str | None, typer.Option(metavar="TEXT", help="The reason, which stays in the journal.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be erased, and change nothing.")] = False,
+    lake: LakeOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     place: Place,
     form: Form,
@@ -57,7 +68,7 @@ def erase(
     why = reason or (f"--keep {keep}" + "".join(f" --tag {each}" for each in tag or ()) if keep else "")
     if not why:
         raise CallerError("say why with --reason: it stays in the journal when the episode is gone")
-    return asyncio.run(_erase(place, episodes or [], keep, tag or [], why, form, dry_run=dry_run, yes=yes))
+    return asyncio.run(_erase(place, episodes or [], keep, tag or [], why, form, lake, dry_run=dry_run, yes=yes))
 
 
 async def _erase(
@@ -67,6 +78,7 @@ async def _erase(
     tags: list[str],
     reason: str,
     form: Form,
+    lake: str | None,
     *,
     dry_run: bool,
     yes: bool,
@@ -83,7 +95,8 @@ async def _erase(
             _ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
         await log.close()
         log = await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id)
-        done = await removal.erase(log, rows, reason=reason, spool=place.spool or place.address.default_spool)
+        spool = place.spool or place.address.default_spool
+        done = await removal.erase(log, rows, reason=reason, spool=spool, lake=lake)
     finally:
         await log.close()
     _print(form, f"Erased from {place.address}", [each.removed for each in done])

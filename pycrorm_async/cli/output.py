@@ -198,6 +198,18 @@ StatusOption = Annotated[
 TagOption = Annotated[
     list[str] | None, typer.Option("--tag", metavar="TAG", help="Only episodes with this tag; repeatable: with all.")
 ]
+LakeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--lake",
+        "--to",
+        "--from",
+        envvar="PYCRORM_LAKE",
+        metavar="LAKE",
+        help="The lake: ducklake:FOLDER, or with its catalog on a server ducklake:postgresql://user@host/database#FOLDER.",
+        show_envvar=True,
+    ),
+]
 CsvOption = Annotated[
     bool | None,
     typer.Option(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
@@ -29,6 +29,7 @@ from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress, shared_address
+from pycrorm_async.store.lake import PREFIX, Lake
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -36,6 +37,10 @@ from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
+
+
+Source: TypeAlias = EventLog | Lake
+"""What a copy reads: a memory, or a lake, of which archived episodes are restored."""
 
 
 @dataclass(frozen=True)
@@ -83,21 +88,26 @@ async def copy_episodes(
     episode does not prevent copying the others. Raises `UnknownEpisode`, `CallerError` if both are the same memory, and
     the errors of `Memory.open`; events copied until then stay.
     """
-    source_address, target_address = shared_address(source), shared_address(target)
-    log = await EventLog.open(source_address, create=False)
+    target_address = shared_address(target)
+    log: Source
+    if source.startswith(PREFIX):
+        log = Lake(source)
+    else:
+        log = await EventLog.open(shared_address(source), create=False)
     try:
-        chosen = {row.number: row for row in [await episode_named(log, each) for each in episodes]}
+        named = [log.named(each) if isinstance(log, Lake) else await episode_named(log, each) for each in episodes]
+        chosen = {row.id: row for row in named}
         rows = list(chosen.values()) if episodes else await log.episodes()
         async with _open_target(target_address, log) as (target_log, destination):
             copier = _Copier(log, target_log, destination, settings or Settings(), report_progress)
             done = await copier.copy(rows)
     finally:
         await log.close()
-    return CopySummary(source_address.to_type, target_address.to_type, done)
+    return CopySummary(str(log.address), target_address.to_type, done)
 
 
 @asynccontextmanager
-async def _open_target(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tuple[EventLog, LogAndTables]]:
+async def _open_target(address: DatabaseAddress, source: Source) -> AsyncIterator[tuple[EventLog, LogAndTables]]:
     """Open the target's log and tables, creating them if they are missing, with the source's placement if possible."""
     placement = PLAIN if address.is_sqlite else Placement((await source.placement()).partitions)
     log = await EventLog.open(address, create=True, placement=placement)
@@ -107,6 +117,7 @@ async def _open_target(address: DatabaseAddress, source: EventLog) -> AsyncItera
                 f"{source.address} and {address} are the same memory, or file copies of one memory: copy to a new URL"
             )
         log.blobs.source = source.blobs
+        log.blobs.restores = isinstance(source, Lake)
         projector = Projector(log, installed=own_projections())
         await retry(projector.open, backoff=BRIEF)  # another copy may be creating the tables
         yield log, LogAndTables(log, projector)
@@ -119,7 +130,7 @@ class _Copier:
 
     def __init__(
         self,
-        source: EventLog,
+        source: Source,
         target: EventLog,
         destination: LogAndTables,
         settings: Settings,
@@ -142,7 +153,8 @@ class _Copier:
         self._of = sum(row.head for row in rows)
         before = await self._heads(rows)
         removed = await self._target.removed([row.identity for row in rows if is_episode_id(row.id)])
-        self._refused |= {each.id: str(each) for each in removed.values()}
+        restores = self._target.blobs.restores
+        self._refused |= {each.id: str(each) for each in removed.values() if each.archived_in is None or not restores}
         for row in rows:
             if row.id in self._refused:
                 continue
@@ -154,6 +166,8 @@ class _Copier:
         await self._fold({row.id for row in rows})
         await retry(self._destination.fold, backoff=BRIEF)  # the cases, too
         after = await self._heads(rows)
+        if isinstance(self._source, Lake):
+            rows = await self._numbered(self._source, rows)
         stopped = {**await self._destination.stopped(), **self._refused}
         return tuple(
             EpisodeCopy(
@@ -206,6 +220,18 @@ class _Copier:
                 await anext(target_pages)  # raises `LogDamaged` with the missing event
             self._progress(len(page))
 
+    async def _numbered(self, lake: Lake, rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:
+        """Compare the digests of restored episodes with those of the lake; return their rows with their numbers."""
+        restored = await self._target.heads([row.identity for row in rows])
+        archived = lake.episode_rows([row.id for row in rows])
+        numbers = {row.id: row.number for row in restored.values()}
+        digests = await self._target.last_digests(min(numbers.values(), default=1), max(numbers.values(), default=1))
+        for row in restored.values():
+            digest, there = digests.get(row.number), archived[row.id]
+            if digest is not None and digest.sequence == there.head and digest.digest != there.digest:
+                self._damage[row.id] = f"episode {row.id}: its digest differs from that in {lake.address}"
+        return [row._replace(number=numbers.get(row.id, 0)) for row in rows]
+
     def _progress(self, count: int) -> None:
         self._done += count
         self._report_progress(self._done, self._of)
@@ -236,8 +262,7 @@ class _Copier:
 
     async def _declarations(self, events: Iterable[Sequence[StoredEvent]]) -> list[Record]:
         """Return the declarations that these events name and that were not sent yet, in the source's order."""
-        named = (_declaration(each) for each in chain.from_iterable(events) if each.type in _DECLARED_BY)
-        missing = {each for each in named if each is not None and each not in self._sent}
+        missing = declared_by(chain.from_iterable(events)) - self._sent
         # Read after the events, because each declaration is stored before its first use.
         described = [each for each in missing if declaration_type(each) == "DescriptionDeclared"]
         descriptions = await self._source.descriptions(described)
@@ -266,6 +291,12 @@ class _CopiedType(msgspec.Struct):
 
 
 _DECLARED_BY = {"NodeStarted": attrgetter("designator"), "ObjectAdded": attrgetter("description")}
+
+
+def declared_by(events: Iterable[StoredEvent]) -> set[str]:
+    """Return the fingerprints of the types and descriptions that these events name."""
+    named = (_declaration(each) for each in events if each.type in _DECLARED_BY)
+    return {each for each in named if each is not None}
 
 
 def _declaration(event: StoredEvent) -> str | None:

@@ -35,6 +35,7 @@ from pycrorm_async.queue.stored_segments import forget_stored
 from pycrorm_async.recall.cases import BLOCKS, remove_cases
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.lake import erase_in_lake
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
 
@@ -79,9 +80,31 @@ def _refuse_running(row: EpisodeRow | RemovedEpisode) -> None:
 
 
 async def erase(
-    log: EventLog, rows: Sequence[EpisodeRow | RemovedEpisode], *, reason: str, spool: Path
+    log: EventLog,
+    rows: Sequence[EpisodeRow | RemovedEpisode],
+    *,
+    reason: str,
+    spool: Path,
+    lake: str | None = None,
 ) -> list[ErasedEpisode]:
-    """Erase these episodes, or finish their erasure. Raises `CallerError` for one that runs."""
+    """Erase these episodes, or finish their erasure, also in this lake, and in the one in which one is archived.
+
+    Raises `CallerError` for one that runs, `MissingExtra` for a lake without the package.
+    """
+    lakes: dict[str, list[str]] = {} if lake is None else {lake: [each.id for each in rows]}
+    archived = [each for each in rows if isinstance(each, RemovedEpisode) and each.archived_in is not None]
+    for each in archived:
+        lakes.setdefault(each.archived_in or "", []).append(each.id)
+    for address, ids in lakes.items():
+        erase_in_lake(address, ids)
+    if archived:
+        async with log.writing() as connection:
+            now_ns = SYSTEM_CLOCK.wall_ns()
+            changed = [
+                each._replace(archived_in=None, removed_wall_ns=now_ns, reason=reason, finished_wall_ns=None)
+                for each in archived
+            ]
+            await dialect_of(connection).execute(connection, schema.UPSERT_REMOVED, removed=changed)
     there = [each for each in rows if isinstance(each, EpisodeRow)]
     left: list[str] = []
     for first in range(0, len(there), EPISODES_AT_ONCE):

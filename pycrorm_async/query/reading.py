@@ -54,6 +54,7 @@ from pycrorm_async.query.snapshot import Moment, as_of
 from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.query.text import quiet, view
 from pycrorm_async.store.address import DatabaseAddress, no_tables
+from pycrorm_async.store.lake import open_lake
 from pycrorm_async.store.log import EventLog
 
 if TYPE_CHECKING:
@@ -367,6 +368,22 @@ class Reading:
         await self._ready()
         with self._log.translated():
             return await self._log.blobs.read(name)
+
+    async def lake(self, address: str | None = None, sql: str = "FROM event") -> Any:
+        """Return the events of a lake, or a query of it, as a relation of DuckDB, which can only read.
+
+        >>> (await memory.lake("ducklake:/nfs/lake")).aggregate("type, count(*)")
+
+        Without an address, of the lake in which this memory archived last. Raises `CallerError`, `MissingExtra`,
+        `DatabaseUnavailable`.
+        """
+        if address is None:
+            await self._ready()
+            archived = [each for each in await self._log.all_removed() if each.archived_in is not None]
+            if not archived:
+                raise CallerError("this memory has archived nothing yet: name the lake")
+            address = max(archived, key=lambda each: each.removed_wall_ns).archived_in
+        return open_lake(str(address)).sql(sql)
 
     async def number_of(self, episode: object) -> int:
         """Return the number that this database gave to an episode or its UUID. Raises `UnknownEpisode`."""

@@ -165,6 +165,14 @@ class CaseBlock:
         """Return the block without the cases of these nodes."""
         return self._kept({name: np.isin(each.nodes, nodes, invert=True) for name, each in self.groups.items()})
 
+    def pruned(self) -> CaseBlock:
+        """Return the block with dictionaries of the words that its cases have, and no others."""
+        pruned = {
+            name: replace(group, texts={feature: each.pruned() for feature, each in group.texts.items()})
+            for name, group in self.groups.items()
+        }
+        return merge([replace(self, groups=pruned)])
+
     def of_episodes(self, first: int, end: int) -> CaseBlock:
         """Return the block with the cases of the episodes from number `first` up to but not including `end`."""
         groups = self.groups.items()

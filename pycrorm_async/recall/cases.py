@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import atan2
 from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
@@ -680,8 +680,7 @@ async def remove_cases(connection: AsyncConnection, generation: int, episodes: C
             continue
         await connection.execute(delete(table).where(table.c.id == each.number))
         if len(kept):
-            whole = replace(CaseBlock.of(kept.cases()), left_out=block.left_out)  # without their words
-            [(name, [row])] = rows_of(whole, generation).items()
+            [(name, [row])] = rows_of(kept.pruned(), generation).items()
             turn = max(each.number % _NODE - _FULL_LEVEL, 0) % (_NODE - _FULL_LEVEL - 1)
             number = int(kept.nodes.max()) + _FULL_LEVEL + 1 + turn
             rows = [(number, _NO_EPISODE, each.level, *list(row)[3:])]

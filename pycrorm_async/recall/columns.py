@@ -170,6 +170,15 @@ class Column:
         """Return the column of some of its cases: of these rows, or those for which a mask is True."""
         return Column(self.values[rows], self._words)
 
+    def pruned(self) -> Column:
+        """Return the column with a dictionary of the words that its cases have, and no others."""
+        if self._words is None:
+            return self
+        codes, places = np.unique(self.values, return_inverse=True)
+        words = Words.of(self._words[code - 1] for code in codes.tolist() if code)
+        new = [words.codes[self._words[code - 1]] if code else 0 for code in codes.tolist()]
+        return Column(np.array(new, np.min_scalar_type(len(words)))[places], words)
+
     def recoded(self, words: Words | None) -> Column:
         """Return the column with a dictionary that contains its own."""
         if words is None or words is self._words:

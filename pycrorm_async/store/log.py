@@ -365,6 +365,10 @@ class EventLog:
         dtypes = {fingerprint(each): declared_dtype(each) for each in await self.declarations()}
         return {name: dtype for name, dtype in dtypes.items() if dtype is not None}
 
+    async def named_declarations(self) -> dict[str, bytes]:
+        """Read the payloads of all designator types, by fingerprint."""
+        return {fingerprint(each): each for each in await self.declarations()}
+
     async def descriptions(self, fingerprints: Collection[str]) -> dict[str, bytes]:
         """Read the payloads of these DescriptionDeclared, by fingerprint; those that are not stored are left out."""
         if not fingerprints:

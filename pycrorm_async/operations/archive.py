@@ -1,0 +1,165 @@
+"""`pycrorm archive`: move episodes that have ended from a memory into a lake, which `pycrorm restore` reads.
+
+Theory of operation. Of each episode the events that the lake lacks are added in one transaction of the lake, with the
+types, descriptions and blobs that they name. Then its events are read back, and their digest is compared with that of
+the memory. Only then is the episode removed from the memory (`operations.removal`). A process that is killed between
+the two leaves the episode in both, and the next archive finds it in the lake and removes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from typing import Final, NamedTuple
+
+from pycrorm_async.errors import DamageError, DatabaseError
+from pycrorm_async.events.types import BlobReference, references_in
+from pycrorm_async.operations.copy import declared_by
+from pycrorm_async.operations.removal import EPISODES_AT_ONCE, remove
+from pycrorm_async.progress_bar import ProgressCallback
+from pycrorm_async.projections.rebuild import claimed
+from pycrorm_async.store.address import shared_address
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.lake import Lake, LakeEpisode, digest_after
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode, RunningDigest, Span, StoredEvent
+
+_EVENTS_AT_ONCE: Final = 200_000
+"""Bounds the events of one file of the lake, unless an episode has more, and with them the memory that is used."""
+
+
+class ArchiveSummary(NamedTuple):
+    """The result of an archive: the episodes that left the memory, and the reasons why others stayed, by id."""
+
+    removed: list[RemovedEpisode]
+    stayed: dict[str, str]
+
+
+async def archive_episodes(
+    url: str,
+    address: str,
+    *,
+    before: datetime,
+    reason: str,
+    report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
+) -> ArchiveSummary:
+    """Move the episodes that ended before this time into the lake at this address, which is made if it is missing.
+
+    Leaves out episodes that are stopped or not visible yet. Raises `CallerError` while another archive or rebuild of
+    the memory runs, `MissingExtra`, and errors of both databases; what was moved until then stays moved.
+    """
+    log = await EventLog.open(shared_address(url), create=False)
+    await log.close()
+    log = await EventLog.open(shared_address(url), create=True, belongs_to=log.log_id)
+    summary = ArchiveSummary([], {})
+    try:
+        async with claimed(log):
+            lake = Lake(address, write=True)
+            try:
+                end_ns = before.timestamp() * 1e9
+                rows = [each for each in await log.episodes() if _may_go(each, end_ns)]
+                total, done = sum(each.head for each in rows), 0
+                for some in _parts(rows):
+                    await _archive(log, lake, some, reason, summary)
+                    done += sum(each.head for each in some)
+                    report_progress(done, total)
+            finally:
+                await lake.close()
+            if summary.removed and log.address.is_sqlite:
+                await dialect_of(log.engine).purge(log.engine, ())
+    finally:
+        await log.close()
+    return summary
+
+
+def _may_go(row: EpisodeRow, end_ns: float) -> bool:
+    ended = row.ended_wall_ns is not None and row.ended_wall_ns < end_ns
+    return ended and row.refused is None and row.parked is None and row.folded == row.head
+
+
+def _parts(rows: Sequence[EpisodeRow]) -> Iterator[list[EpisodeRow]]:
+    part: list[EpisodeRow] = []
+    events = 0
+    for row in rows:
+        if part and events + row.head > _EVENTS_AT_ONCE:
+            yield part
+            part, events = [], 0
+        part.append(row)
+        events += row.head
+    if part:
+        yield part
+
+
+async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason: str, summary: ArchiveSummary) -> None:
+    there = lake.episode_rows([each.id for each in rows])
+    kept = await log.last_digests(rows[0].number, rows[-1].number)
+    new: list[tuple[LakeEpisode, Sequence[StoredEvent]]] = []
+    for row in rows:
+        try:
+            events = await _events(log, row)
+            digest = digest_after(RunningDigest.at_start(row.identity), events)
+        except DamageError as damage:
+            summary.stayed[row.id] = str(damage)
+            continue
+        own = kept.get(row.number)
+        if own is not None and own.sequence == row.head and own.digest != digest:
+            summary.stayed[row.id] = "its events do not match its digest: run `pycrorm verify`"
+            continue
+        after = there[row.id].head if row.id in there else 0
+        assert row.ended_wall_ns is not None, "it has ended"
+        episode = LakeEpisode(row.id, row.head, row.started_wall_ns, row.ended_wall_ns, digest)
+        if after > row.head:
+            summary.stayed[row.id] = f"the lake holds {after} events of it, and this memory only {row.head}"
+        else:
+            new.append((episode, events[after:]))
+    lacking = [each for each in new if each[0].id not in there or there[each[0].id] != each[0]]
+    if lacking:
+        await _add(log, lake, lacking)
+    read = lake.digests([each.id for each, _ in new])
+    for each, _ in new:
+        if read.get(each.id) != each.digest:
+            summary.stayed[each.id] = "the lake holds other events of it than this memory"
+    moved = [each for each in rows if each.id not in summary.stayed]
+    digests = {row.number: read[row.id] for row in moved}
+    for first in range(0, len(moved), EPISODES_AT_ONCE):
+        some = moved[first : first + EPISODES_AT_ONCE]
+        summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=digests))
+
+
+async def _events(log: EventLog, row: EpisodeRow) -> list[StoredEvent]:
+    """Read all events of an episode. Raises `LogDamaged` for a missing one."""
+    events = await log.spans([Span(row.number, 0, row.head)])
+    if len(events) < row.head:
+        return [event async for page in log.pages(row) for event in page]
+    return events
+
+
+async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]]) -> None:
+    events = [event for _, some in episodes for event in some]
+    lacking = lake.absent("declaration", "fingerprint", declared_by(events))
+    declarations = await log.descriptions(lacking)
+    if lacking - declarations.keys():
+        declarations |= {name: each for name, each in (await log.named_declarations()).items() if name in lacking}
+    references: dict[str, BlobReference] = {}
+    for kind, payload in [
+        *((each.type, each.payload) for each in events),
+        *(("DescriptionDeclared", each) for each in declarations.values()),
+    ]:
+        if b'"$blob"' in payload:
+            references |= {each.hash: each for each in references_in(kind, payload)}
+    blobs: dict[str, tuple[str, bytes]] = {}
+    for name in lake.absent("blob", "hash", references):
+        content = await log.blobs.read_blob(name)
+        if content is not None:
+            blobs[name] = references[name].media_type, content
+    for attempt in range(_ATTEMPTS):
+        try:
+            return lake.add(episodes, declarations, blobs, log.log_id)
+        except DatabaseError:
+            if attempt == _ATTEMPTS - 1:
+                raise
+    return None
+
+
+_ATTEMPTS: Final = 5
+"""Bounds the attempts to commit to the lake while other memories do."""

@@ -1,0 +1,347 @@
+"""Keep episodes in a lake, a DuckLake: Parquet files in a folder, and a catalog in a SQLite file or on PostgreSQL.
+
+    ducklake:/nfs/lake                                      catalog.sqlite and data/ in this folder
+    ducklake:postgresql://user@host/catalog#/nfs/lake       a catalog on a server; the folder, needed once, behind #
+
+Several memories share one lake: an episode has its UUID as the key, an event the UUID and its sequence. Any DuckDB
+reads the tables `episode`, `event`, `declaration` and `blob`. The catalog keeps the least and the greatest value of a
+column, of texts too, so those of payloads are cleared: otherwise they would outlive an erased episode.
+"""
+
+# ruff: noqa: S608 - the SQL is composed of names and of paths that the caller gave
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
+from contextlib import closing, suppress
+from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    MissingExtra,
+    QueryRefused,
+    UnknownEpisode,
+)
+from pycrorm_async.events.types import references_in
+from pycrorm_async.store.placement import PLAIN, Placement
+from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent
+
+PREFIX: Final = "ducklake:"
+_FORMAT: Final = 1
+_TABLES: Final = {
+    "pycrorm_lake": "format INTEGER",
+    "episode": "id UUID, head INTEGER, started_wall_ns BIGINT, ended_wall_ns BIGINT, digest VARCHAR, memory VARCHAR",
+    "event": "episode UUID, sequence INTEGER, type VARCHAR, version INTEGER, wall_ns BIGINT, monotonic_ns BIGINT,"
+    " payload VARCHAR",
+    "declaration": "fingerprint VARCHAR, payload VARCHAR",
+    "blob": "hash VARCHAR, media_type VARCHAR, content BLOB",
+}
+_PAGE_EVENTS: Final = 5_000
+_EPISODES_AT_ONCE: Final = 200
+"""The episodes that one query reads."""
+
+
+class LakeEpisode(NamedTuple):
+    """An episode of a lake, with the digest of its events."""
+
+    id: str
+    head: int
+    started_wall_ns: int
+    ended_wall_ns: int
+    digest: str
+
+    @property
+    def row(self) -> EpisodeRow:
+        """The row that a log would have of it; the number belongs to a memory, and is 0."""
+        return EpisodeRow(0, self.id, self.head, self.head, self.started_wall_ns, self.ended_wall_ns)
+
+
+def open_lake(address: str, *, write: bool = False) -> Any:
+    """Return a connection of DuckDB whose default database is the lake; with `write` it is made if it is missing.
+
+    Loads the extensions from the installed wheels and downloads nothing. Raises `CallerError`, `MissingExtra`,
+    `DatabaseForeign`, `DatabaseUnavailable`.
+    """
+    catalog, place, data = _parsed(address)
+    if catalog == "sqlite" and write:
+        try:
+            Path(place).parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DatabaseUnavailable(f"{address}: the folder cannot be made: {error.strerror}") from error
+    elif catalog == "sqlite" and not Path(place).exists():
+        raise DatabaseUnavailable(f"{address}: there is no lake: `pycrorm archive --to {address}` makes one")
+    connection = _connect("ducklake", f"{catalog}_scanner")
+    try:
+        options = ["DATA_INLINING_ROW_LIMIT 0", *([f"DATA_PATH '{_quoted(data)}'"] if data else [])]
+        options += [] if write else ["READ_ONLY"]
+        connection.execute(f"ATTACH 'ducklake:{catalog}:{_quoted(place)}' AS lake ({', '.join(options)}); USE lake")
+        fault = _prepare(connection, write=write)
+    except import_module("duckdb").Error as error:
+        connection.close()
+        raise unavailable(address, error) from error
+    if fault is not None:
+        connection.close()
+        raise DatabaseForeign(f"{address} {fault}")
+    return connection
+
+
+def _parsed(address: str) -> tuple[str, str, str]:
+    """Return the kind of the catalog, its place, and the folder of the data. Raises `CallerError`."""
+    place, _, data = address.removeprefix(PREFIX).partition("#")
+    if not address.startswith(PREFIX) or not place:
+        raise CallerError("a lake is named ducklake:FOLDER, or ducklake:postgresql://user@host/database#FOLDER")
+    if place.startswith(("postgresql:", "postgres:")):
+        return "postgres", place, data
+    folder = Path(place).absolute()
+    return "sqlite", f"{folder}/catalog.sqlite", data or f"{folder}/data"
+
+
+def _connect(*extensions: str) -> Any:
+    """Return a connection of DuckDB with these extensions from the installed wheels. Raises `MissingExtra`."""
+    try:
+        duckdb: Any = import_module("duckdb")
+        wheels = [import_module(f"duckdb_extension_{each}") for each in extensions]
+        import_module("pyarrow")
+    except ImportError as error:
+        raise MissingExtra(f"a lake needs DuckDB ({error.name}): pip install 'pycrorm-async[lake]'") from None
+    connection = duckdb.connect(config={"allow_unsigned_extensions": True, "autoinstall_known_extensions": False})
+    for wheel in wheels:
+        [file] = Path(str(wheel.__file__)).parent.rglob("*.duckdb_extension")
+        connection.execute(f"LOAD '{_quoted(str(file))}'")
+    return connection
+
+
+def _prepare(connection: Any, *, write: bool) -> str | None:
+    """Create the tables of a new lake; return the reason why this version cannot use it."""
+    present = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
+    if not present and write:
+        connection.execute("BEGIN")
+        for name, columns in _TABLES.items():
+            connection.execute(f"CREATE TABLE {name} ({columns})")
+        connection.execute(f"INSERT INTO pycrorm_lake VALUES ({_FORMAT}); COMMIT")
+        connection.execute("CALL lake.set_option('parquet_compression', 'zstd')")
+    elif not present >= _TABLES.keys():
+        return "is a lake of another program"
+    [(number,)] = connection.execute("SELECT max(format) FROM pycrorm_lake").fetchall()
+    return f"was made by a newer version: its format is {number}, this reads {_FORMAT}" if number > _FORMAT else None
+
+
+def unavailable(address: str, error: Exception) -> DatabaseUnavailable:
+    """Return the error to raise instead of one of DuckDB: its first line, without a password of the address."""
+    return DatabaseUnavailable(f"{address.partition('@')[0]}: {str(error).splitlines()[0]}")
+
+
+def _quoted(text: str) -> str:
+    return text.replace("'", "''")
+
+
+class Lake:
+    """An open lake, also as the source of a copy. Each call blocks while DuckDB works."""
+
+    def __init__(self, address: str, *, write: bool = False) -> None:
+        catalog, place, _ = _parsed(address)
+        self.address = f"{PREFIX}{Path(place).parent}" if catalog == "sqlite" else address
+        self.log_id = address
+        self.blobs = self
+        self._connection = open_lake(address, write=write)
+        self._listed: list[str] = []
+        self._events: dict[str, list[StoredEvent]] = {}
+
+    async def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+    def execute(self, sql: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Return the rows of a statement. Raises `DatabaseUnavailable`."""
+        try:
+            rows: list[tuple[Any, ...]] = self._connection.execute(sql, list(parameters)).fetchall()
+        except import_module("duckdb").Error as error:
+            raise unavailable(self.address, error) from error
+        return rows
+
+    # --- the source of a copy -----------------------------------------------------------------------------------
+
+    def episode_rows(self, ids: Collection[str] | None = None) -> dict[str, LakeEpisode]:
+        """Return the episodes, or those of these ids, by id."""
+        chosen = "" if ids is None else "WHERE id IN (SELECT unnest(?)::UUID)"
+        columns = "id::VARCHAR, max(head), min(started_wall_ns), max(ended_wall_ns), arg_max(digest, head)"
+        query = f"SELECT {columns} FROM episode {chosen} GROUP BY id ORDER BY id"
+        rows = {row[0]: LakeEpisode(*row) for row in self.execute(query, [] if ids is None else [list(ids)])}
+        self._listed = list(dict.fromkeys((*self._listed, *rows)))
+        return rows
+
+    async def placement(self) -> Placement:
+        """Return the placement of a memory that is made for these episodes."""
+        return PLAIN
+
+    async def episodes(self) -> list[EpisodeRow]:
+        """Read every episode, by id."""
+        return [each.row for each in self.episode_rows().values()]
+
+    def named(self, name: str) -> EpisodeRow:
+        """Find an episode by its id or first digits of it. Raises `UnknownEpisode`."""
+        rows = self.execute(
+            "SELECT DISTINCT id::VARCHAR FROM episode WHERE starts_with(id::VARCHAR, ?)", [name.lower()]
+        )
+        if len(rows) != 1:
+            how = "no episode has" if not rows else f"{len(rows)} episodes have"
+            raise UnknownEpisode(f"{self.address}: {how} an id that begins with {name!r}")
+        return self.episode_rows([rows[0][0]])[rows[0][0]].row
+
+    async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
+        """Yield the events of an episode in pages; one that two memories archived at the same time, once.
+
+        Reads it together with those that were listed behind it, because a query costs more than an episode.
+        """
+        if episode.id not in self._events:
+            place = self._listed.index(episode.id)
+            self._events = self._events_of(self._listed[place : place + _EPISODES_AT_ONCE])
+        events = self._events.pop(episode.id, [])[after:]
+        for first in range(0, len(events), _PAGE_EVENTS):
+            yield events[first : first + _PAGE_EVENTS]
+
+    def _events_of(self, ids: Sequence[str]) -> dict[str, list[StoredEvent]]:
+        query = (
+            "SELECT DISTINCT episode::VARCHAR, sequence, type, version, wall_ns, monotonic_ns, encode(payload)"
+            " FROM event WHERE episode IN (SELECT unnest(?)::UUID) ORDER BY episode, sequence"
+        )
+        events: dict[str, list[StoredEvent]] = {}
+        for row in self.execute(query, [list(ids)]):
+            events.setdefault(row[0], []).append(StoredEvent(0, *row[1:]))
+        return events
+
+    async def declarations(self) -> list[bytes]:
+        """Read the payloads of all declarations of designator types."""
+        query = "SELECT DISTINCT payload FROM declaration WHERE fingerprint < 'g'"
+        return [payload.encode() for (payload,) in self.execute(query)]
+
+    async def descriptions(self, fingerprints: Collection[str]) -> dict[str, bytes]:
+        """Read the payloads of these descriptions, by fingerprint."""
+        query = "SELECT DISTINCT fingerprint, payload FROM declaration WHERE fingerprint IN (SELECT unnest(?))"
+        return {name: payload.encode() for name, payload in self.execute(query, [list(fingerprints)])}
+
+    async def read_blob(self, name: str) -> bytes | None:
+        """Return a blob; None if it is missing. Implements `BlobSource`."""
+        for (content,) in self.execute("SELECT content FROM blob WHERE hash = ? LIMIT 1", [name]):
+            return bytes(content) if sha256(content).hexdigest() == name else None
+        return None
+
+    # --- archive and erase ----------------------------------------------------------------------------------------
+
+    def digests(self, ids: Collection[str]) -> dict[str, str]:
+        """Compute the digests of these episodes from the events in the lake."""
+        starts = {name: RunningDigest.at_start(EpisodeRow(0, name, 0, 0, 0).identity) for name in ids}
+        return {name: digest_after(starts[name], events) for name, events in self._events_of([*ids]).items()}
+
+    def add(
+        self,
+        episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]],
+        declarations: Mapping[str, bytes],
+        blobs: Mapping[str, tuple[str, bytes]],
+        memory: str,
+    ) -> None:
+        """Add episodes, each with the events that the lake lacks, and what they refer to, in one transaction."""
+        ids = [each.id for each, _ in episodes]
+        events = [(each.id, *event[1:]) for each, some in episodes for event in some]
+        try:
+            self.execute("BEGIN")
+            self.execute("DELETE FROM episode WHERE id IN (SELECT unnest(?)::UUID)", [ids])
+            self._insert("episode", [(*each, memory) for each, _ in episodes])
+            self._insert("event", events)
+            self._insert("declaration", list(declarations.items()))
+            self._insert("blob", [(name, *blob) for name, blob in blobs.items()])
+            self.execute("COMMIT")
+        except BaseException:  # an interruption too
+            with suppress(DatabaseUnavailable):
+                self.execute("ROLLBACK")
+            raise
+        self._clear_bounds()
+
+    def _insert(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Insert rows in one statement, which writes one file."""
+        if rows:
+            arrow: Any = import_module("pyarrow")
+            columns = [arrow.array(values) for values in zip(*rows, strict=True)]
+            named = {f"c{place}": column for place, column in enumerate(columns)}
+            self._connection.register("new_rows", arrow.table(named))
+            decoded = {"event": "* REPLACE (decode(c6) AS c6)", "declaration": "* REPLACE (decode(c1) AS c1)"}
+            try:
+                self.execute(f"INSERT INTO {table} SELECT {decoded.get(table, '*')} FROM new_rows ORDER BY c0, c1")
+            finally:
+                self._connection.unregister("new_rows")
+
+    def absent(self, table: str, key: str, names: Collection[str]) -> set[str]:
+        """Return those of these keys that a table of the lake lacks."""
+        query = f"SELECT DISTINCT {key} FROM {table} WHERE {key} IN (SELECT unnest(?))"
+        return {*names} - {name for (name,) in self.execute(query, [[*names]])}
+
+    def erase(self, ids: Sequence[str]) -> None:
+        """Erase episodes, if the lake has them: write their files again without them, and delete the old ones."""
+        if not self.episode_rows(ids):
+            return
+        query = "SELECT type, encode(payload) FROM event WHERE episode IN (SELECT unnest(?)::UUID)"
+        referring = self.execute(f"{query} AND contains(payload, '\"$blob\"')", [list(ids)])
+        blobs = [each.hash for kind, payload in referring for each in references_in(kind, payload)]
+        for table, key in (("event", "episode"), ("episode", "id")):
+            self.execute(f"DELETE FROM {table} WHERE {key} IN (SELECT unnest(?)::UUID)", [list(ids)])
+        referred = " AND ".join(
+            f"NOT EXISTS (SELECT 1 FROM {each} AS e WHERE contains(e.payload, blob.hash))"
+            for each in ("event", "declaration")
+        )
+        self.execute(f"DELETE FROM blob WHERE hash IN (SELECT unnest(?::VARCHAR[])) AND {referred}", [blobs])
+        for call in (
+            "ducklake_rewrite_data_files('lake', delete_threshold => 0)",
+            "ducklake_expire_snapshots('lake', older_than => TIMESTAMP '9999-01-01')",
+            "ducklake_cleanup_old_files('lake', cleanup_all => true)",
+        ):
+            self.execute(f"SELECT count(*) FROM {call}")  # not its rows, whose times Python would convert with pytz
+        self._clear_bounds()
+
+    def _clear_bounds(self) -> None:
+        catalog, place, _ = _parsed(self.address)
+        try:  # on a connection of its own, because that of the lake has read the catalog and locks it
+            with closing(_connect(f"{catalog}_scanner")) as connection:
+                connection.execute(f"ATTACH '{_quoted(place)}' AS catalog (TYPE {catalog}); USE catalog")
+                for name in ("ducklake_file_column_stats", "ducklake_table_column_stats"):
+                    connection.execute(
+                        f"UPDATE {name} SET min_value = NULL, max_value = NULL WHERE EXISTS (FROM ducklake_column AS c"
+                        f" WHERE c.table_id = {name}.table_id AND c.column_id = {name}.column_id"
+                        " AND c.column_name IN ('payload', 'content'))"
+                    )
+        except import_module("duckdb").Error as error:
+            raise unavailable(self.address, error) from error
+
+
+def digest_after(running: RunningDigest, events: Sequence[StoredEvent]) -> str:
+    """Add events to a digest and return it."""
+    ends = running.add(events)
+    return ends[-1][1] if ends and ends[-1][0] == running.sequence else running.digest()
+
+
+def erase_in_lake(address: str, ids: Sequence[str]) -> None:
+    """Erase episodes in a lake, also from the free pages of a catalog in a file."""
+    lake = Lake(address, write=True)
+    try:
+        lake.erase(ids)
+    finally:
+        lake._connection.close()  # noqa: SLF001 - of this module
+    catalog, place, _ = _parsed(address)
+    if catalog == "sqlite":
+        with closing(sqlite3.connect(place)) as connection:
+            connection.execute("VACUUM")
+
+
+def query_lake(address: str, sql: str) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
+    """Return the columns and the rows of a query. Raises `QueryRefused` for a wrong one."""
+    with closing(open_lake(address)) as connection:
+        try:
+            answer = connection.execute(sql)
+            return tuple(each[0] for each in answer.description), answer.fetchall()
+        except import_module("duckdb").Error as error:
+            raise QueryRefused(f"{address}: {str(error).splitlines()[0]}") from error

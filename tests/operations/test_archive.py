@@ -1,0 +1,212 @@
+"""Archived episodes are in the lake and not in the memory, and a restored memory is as it was."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sqlite3
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from sqlalchemy import event
+from sqlalchemy.engine import Engine
+
+from pycrorm_async import Reading
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.removal import erasable, erase
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.lake import Lake, query_lake
+from pycrorm_async.store.log import EventLog
+from tests.commands import pycrorm
+from tests.crash.forked_processes import ForkedProcess
+from tests.databases import ask, put_memory
+from tests.operations.memories import everything, notes
+from tests.operations.test_removal import SECRET, assert_clean, erased, places_with, recorded
+from tests.table_comparison import differences, logs_of, tables_of
+
+pytest.importorskip("duckdb_extension_ducklake", reason="the extra [lake] is not installed")
+pytestmark = pytest.mark.slow
+
+LATER = datetime(2100, 1, 1, tzinfo=UTC)
+
+
+@pytest.fixture
+def lake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.chdir(tmp_path)
+    return f"ducklake:{tmp_path}/lake"
+
+
+async def archived(url: str, lake: str) -> ArchiveSummary:
+    return await archive_episodes(url, lake, before=LATER, reason="old")
+
+
+def shown_digests(url: str) -> list[tuple[object, ...]]:
+    return ask(
+        url,
+        "SELECT e.number, e.id, d.sequence, d.digest FROM pycrorm_digest AS d"
+        " JOIN episode AS e ON e.number = d.episode ORDER BY 1, 3",
+    )
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_restored_memory_has_the_rows_numbers_and_digests_that_it_had(database_url: str, lake: str) -> None:
+    await everything(database_url)
+    tables, logs, digests = tables_of(database_url), logs_of(database_url), shown_digests(database_url)
+    summary = await archived(database_url, lake)
+    assert (len(summary.removed), summary.stayed) == (len(logs), {})
+    assert (logs_of(database_url), tables_of(database_url), shown_digests(database_url)) == ({}, {}, [])
+    await assert_clean(database_url)
+    _, rows = query_lake(
+        lake,
+        "SELECT episode::VARCHAR, sequence, type, version, wall_ns, monotonic_ns, payload FROM event ORDER BY 1, 2",
+    )
+    assert rows == [(each, *some) for each, events in sorted(logs.items()) for some in events]
+    async with Reading.open(database_url) as reading:
+        with pytest.raises(UnknownEpisode, match=rf"`pycrorm restore {min(logs)} --from {lake}` brings it back"):
+            await reading.episode(min(logs))
+        assert (await reading.lake()).aggregate("count(DISTINCT episode)").fetchall() == [(len(logs),)]
+    for _ in range(2):  # what is there already is compared
+        done = await copy_episodes(lake, database_url)
+        assert [(each.damage, each.stopped) for each in done.episodes if each.damage or each.stopped] == []
+    assert logs_of(database_url) == logs
+    assert differences(tables, tables_of(database_url)) == []
+    assert shown_digests(database_url) == digests
+    await assert_clean(database_url)
+
+
+async def test_several_memories_archive_into_one_lake_and_what_arrives_of_an_archived_episode_is_not_stored_again(
+    tmp_path: Path, lake: str
+) -> None:
+    sites = [put_memory(tmp_path / f"{name}.db") for name in "abc"]
+    for each in sites:
+        await recorded(each, each[-4:], "second")
+    logs = {episode: events for each in sites for episode, events in logs_of(each).items()}
+    copy = put_memory(tmp_path / "copy.db")
+    await copy_episodes(sites[0], copy)
+    await asyncio.gather(*(archived(each, lake) for each in sites))
+    rows = query_lake(lake, "SELECT episode::VARCHAR, count(*) FROM event GROUP BY 1 ORDER BY 1")[1]
+    assert rows == [(episode, len(events)) for episode, events in sorted(logs.items())]
+    done = await copy_episodes(copy, sites[0])
+    assert ["was archived" in (each.stopped or "") for each in done.episodes] == [True, True]
+    assert (await archived(copy, lake)).stayed == {}  # the lake has them already
+    assert query_lake(lake, "SELECT episode::VARCHAR, count(*) FROM event GROUP BY 1 ORDER BY 1")[1] == rows
+
+
+def archive_until(url: str, lake: str, last: int) -> None:
+    """Archive, and die before statement number `last` of the memory; with 0 to the end, and print their count."""
+    count = 0
+
+    def die_at_last(*_: object) -> None:
+        nonlocal count
+        count += 1
+        if count == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    event.listen(Engine, "before_cursor_execute", die_at_last)
+    event.listen(Engine, "commit", die_at_last)
+    asyncio.run(archived(url, lake))
+    print(count, flush=True)
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_an_archive_that_is_killed_at_any_step_is_finished_by_the_next(database_url: str, lake: str) -> None:
+    await recorded(database_url, "first")
+    whole = ForkedProcess(archive_until, database_url, lake, 0)
+    assert whole.wait() == 0, whole.lines
+    count = int(whole.lines[-1])
+    for last in (count // 4, count // 2, count - 2, count):
+        ids = await recorded(database_url, "a", "b")
+        logs = logs_of(database_url)
+        process = ForkedProcess(archive_until, database_url, lake, last)
+        assert process.wait() in (-9, 0), process.lines
+        await assert_clean(database_url)
+        assert (await archived(database_url, lake)).stayed == {}
+        assert logs_of(database_url) == {}
+        source = Lake(lake)
+        try:
+            for each in ids:
+                events = [event for page in [page async for page in source.pages(source.named(each))] for event in page]
+                assert [(*some[1:6], some[6].decode()) for some in events] == logs[each]
+        finally:
+            await source.close()
+
+
+async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp_path: Path, lake: str) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    ids = await recorded(url, "first", SECRET)
+    await archived(url, lake)
+    folder = tmp_path / "lake"
+    [done] = await erased(url, ids[1])
+    assert (done.left, done.removed.archived_in) == ((), None)
+    files = [each for each in folder.rglob("*") if each.is_file()]
+    assert [each for each in files if SECRET.encode() in each.read_bytes()] == []
+    parquet = [str(each) for each in files if each.parent.name == "event"]
+    query = f"SELECT count(*) FROM read_parquet({parquet}) WHERE payload LIKE '%{SECRET}%'"
+    assert query_lake(lake, query)[1] == [(0,)]
+    assert places_with(SECRET, url) == []
+    with pytest.raises(UnknownEpisode):
+        await copy_episodes(lake, url, episodes=[ids[1]])
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:  # one that the lake still holds is erased there by name
+        await copy_episodes(lake, url)
+        await erase(log, await erasable(log, ["1"]), reason="asked", spool=tmp_path / "memory.db.spool", lake=lake)
+    finally:
+        await log.close()
+    assert query_lake(lake, "SELECT count(*) FROM event")[1] == [(0,)]
+
+
+async def test_an_episode_that_differs_from_the_lake_stays_in_the_memory(tmp_path: Path, lake: str) -> None:
+    url, other = put_memory(tmp_path / "memory.db"), put_memory(tmp_path / "other.db")
+    await notes(url, "a")
+    await copy_episodes(url, other)
+    await archived(other, lake)
+    with sqlite3.connect(tmp_path / "memory.db") as connection:
+        connection.executescript(
+            "DROP TRIGGER event_is_not_updated; DROP TRIGGER digest_is_not_deleted; DELETE FROM pycrorm_digest;"
+            "UPDATE event SET wall_ns = wall_ns + 1 WHERE sequence = 2"
+        )
+    summary = await archived(url, lake)
+    assert (summary.removed, [*summary.stayed.values()]) == ([], ["the lake holds other events of it than this memory"])
+    assert len(logs_of(url)) == 1
+
+
+async def test_bad_lakes_are_refused_in_one_line(tmp_path: Path, lake: str) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    await notes(url, "a")
+    with pytest.raises(DatabaseUnavailable, match="there is no lake"):
+        query_lake(lake, "SELECT 1")
+    with pytest.raises(CallerError, match="a lake is named"):
+        await archived(url, "s3:x")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Exception, match=r"ducklake:.*file"):
+        await archived(url, f"ducklake:{tmp_path}/file")
+    await archived(url, lake)
+    with pytest.raises(CallerError, match="read-only"):
+        query_lake(lake, "DELETE FROM event")
+    source = Lake(lake, write=True)
+    source.execute("INSERT INTO pycrorm_lake VALUES (99)")
+    await source.close()
+    with pytest.raises(DatabaseForeign, match="was made by a newer version: its format is 99"):
+        query_lake(lake, "SELECT 1")
+    with pytest.raises(DatabaseForeign, match="newer version"):
+        await archived(url, lake)
+
+
+def test_the_commands_archive_query_and_restore(tmp_path: Path) -> None:
+    url, lake = f"sqlite:///{tmp_path}/memory.db", "ducklake:lake"
+    [identity] = asyncio.run(recorded(url, "a note"))
+    done = pycrorm("archive", "--before", "2100-01-01", "--to", lake, "--url", url, cwd=tmp_path)
+    assert (done.returncode, identity in done.stdout) == (0, True)
+    listed = pycrorm("episodes", "--url", url, cwd=tmp_path)
+    assert "1 episode archived or erased" in listed.stderr
+    answer = pycrorm("lake", "query", "SELECT count(*) AS n FROM event", "--from", lake, "--json", cwd=tmp_path)
+    assert (answer.returncode, '"n": 8' in answer.stdout or '"n": 7' in answer.stdout) == (0, True)
+    wrong = pycrorm("lake", "query", "SELEC 1", "--from", lake, cwd=tmp_path)
+    assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
+    back = pycrorm("restore", identity[:20], "--from", lake, "--url", url, cwd=tmp_path)
+    assert back.returncode == 0, back.stderr
+    assert pycrorm("verify", "--url", url, cwd=tmp_path).returncode == 0
