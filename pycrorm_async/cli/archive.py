@@ -16,6 +16,7 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.progress_bar import progress_bar
+from pycrorm_async.store.lake import shown
 
 
 def archive(
@@ -37,7 +38,7 @@ def archive(
     summary = asyncio.run(_archive(place, lake, before))
     rows = [(each.number, each.id, each.head, each.digest) for each in summary.removed]
     document = {"archived": [each._asdict() for each in summary.removed], "stayed": summary.stayed}
-    print_rows(form, document, f"Archived in {lake}", ("episode", "id", "events", "digest"), rows)
+    print_rows(form, document, f"Archived in {shown(lake)}", ("episode", "id", "events", "digest"), rows)
     for name, why in summary.stayed.items():
         problem(f"episode {name} stays: {why}")
     place.note_pending_events()

@@ -11,7 +11,7 @@ import typer
 
 from pycrorm_async.cli.output import Form, LakeOption, print_rows
 from pycrorm_async.errors import CallerError
-from pycrorm_async.store.lake import query_lake
+from pycrorm_async.store.lake import query_lake, shown
 
 
 def query(
@@ -25,7 +25,7 @@ def query(
         raise CallerError("name the lake with --from ducklake:FOLDER")
     columns, rows = query_lake(lake, sql)
     document = [dict(zip(columns, row, strict=True)) for row in rows]
-    print_rows(form, document, f"{len(rows)} rows of {lake}", columns, rows)
+    print_rows(form, document, f"{len(rows)} rows of {shown(lake)}", columns, rows)
 
 
 VERBS = {"query": query}

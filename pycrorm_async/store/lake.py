@@ -29,6 +29,7 @@ from pycrorm_async.errors import (
     UnknownEpisode,
 )
 from pycrorm_async.events.types import references_in
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent
 
@@ -87,7 +88,7 @@ def open_lake(address: str, *, write: bool = False) -> Any:
         raise unavailable(address, error) from error
     if fault is not None:
         connection.close()
-        raise DatabaseForeign(f"{address} {fault}")
+        raise DatabaseForeign(f"{shown(address)} {fault}")
     return connection
 
 
@@ -132,9 +133,27 @@ def _prepare(connection: Any, *, write: bool) -> str | None:
     return f"was made by a newer version: its format is {number}, this reads {_FORMAT}" if number > _FORMAT else None
 
 
+def shown(address: str) -> str:
+    """Return the address of a lake with the absolute path of its folder, or without the password of its catalog.
+
+    >>> shown("ducklake:postgresql://lab:secret@server/catalog#/nfs/lake")
+    'ducklake:postgresql://lab@server/catalog#/nfs/lake'
+    """
+    catalog, place, data = _parsed(address)
+    if catalog == "sqlite":
+        return f"{PREFIX}{Path(place).parent}"
+    return f"{PREFIX}{DatabaseAddress.parse(place).to_type}{f'#{data}' if data else ''}"
+
+
 def unavailable(address: str, error: Exception) -> DatabaseUnavailable:
-    """Return the error to raise instead of one of DuckDB: its first line, without a password of the address."""
-    return DatabaseUnavailable(f"{address.partition('@')[0]}: {str(error).splitlines()[0]}")
+    """Return the error to raise instead of one of DuckDB, whose further lines may have a password."""
+    return DatabaseUnavailable(f"{shown(address)}: {_first_line(error, address)}")
+
+
+def _first_line(error: Exception, address: str) -> str:
+    """Return the first line of an error of DuckDB; that of a server's catalog may repeat its URL."""
+    place = _parsed(address)[1]
+    return str(error).splitlines()[0].replace(place, "the catalog")
 
 
 def _quoted(text: str) -> str:
@@ -145,9 +164,9 @@ class Lake:
     """An open lake, also as the source of a copy. Each call blocks while DuckDB works."""
 
     def __init__(self, address: str, *, write: bool = False) -> None:
-        catalog, place, _ = _parsed(address)
-        self.address = f"{PREFIX}{Path(place).parent}" if catalog == "sqlite" else address
-        self.log_id = address
+        self.address = shown(address)
+        self.log_id = self.address
+        self._given = address
         self.blobs = self
         self._connection = open_lake(address, write=write)
         self._listed: list[str] = []
@@ -162,7 +181,7 @@ class Lake:
         try:
             rows: list[tuple[Any, ...]] = self._connection.execute(sql, list(parameters)).fetchall()
         except import_module("duckdb").Error as error:
-            raise unavailable(self.address, error) from error
+            raise unavailable(self._given, error) from error
         return rows
 
     # --- the source of a copy -----------------------------------------------------------------------------------
@@ -304,7 +323,7 @@ class Lake:
         self._clear_bounds()
 
     def _clear_bounds(self) -> None:
-        catalog, place, _ = _parsed(self.address)
+        catalog, place, _ = _parsed(self._given)
         try:  # on a connection of its own, because that of the lake has read the catalog and locks it
             with closing(_connect(f"{catalog}_scanner")) as connection:
                 connection.execute(f"ATTACH '{_quoted(place)}' AS catalog (TYPE {catalog}); USE catalog")
@@ -315,7 +334,7 @@ class Lake:
                         " AND c.column_name IN ('payload', 'content'))"
                     )
         except import_module("duckdb").Error as error:
-            raise unavailable(self.address, error) from error
+            raise unavailable(self._given, error) from error
 
 
 def digest_after(running: RunningDigest, events: Sequence[StoredEvent]) -> str:
@@ -344,4 +363,4 @@ def query_lake(address: str, sql: str) -> tuple[tuple[str, ...], list[tuple[Any,
             answer = connection.execute(sql)
             return tuple(each[0] for each in answer.description), answer.fetchall()
         except import_module("duckdb").Error as error:
-            raise QueryRefused(f"{address}: {str(error).splitlines()[0]}") from error
+            raise QueryRefused(f"{shown(address)}: {_first_line(error, address)}") from error
