@@ -17,7 +17,7 @@ from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.output_files import refuse_existing, write_file
 from pycrorm_async.report.write import asset, html_page, program
 
-_MODULES = "dom episode bodies extent path_lines scene_camera scene_view map_view comparison".split()
+_MODULES = "dom episode bodies extent path_lines scene_camera seen_view scene_view map_view comparison".split()
 """The modules of the page's program, every one behind those that it imports."""
 
 
@@ -34,7 +34,7 @@ async def write_comparison(
     file = Path(path)
     refuse_existing(file, force=force)
     diff = await reading.diff(first, second)
-    documents = [await episode_document(reading, each.number) for each in (diff.first, diff.second)]
+    documents = [await episode_document(reading, each.number, images="none") for each in (diff.first, diff.second)]
     of_episodes = [each for each in diff.differences if each.of != "node"]  # the page compares the nodes itself
     document = {
         "episodes": documents,

@@ -161,7 +161,7 @@ def test_a_node_shows_them_as_text_and_leads_to_them(chrome: Browser, url: str, 
     for width, dark in ((1400, False), (420, True)):
         with chrome.open(tmp_path / "all.pages" / "episode-2.html", width=width, dark=dark) as tab:
             tab.ask("pycrormPage.select(pycrormPage.episode.rootFailures[0])")
-            assert tab.ask("document.querySelectorAll('.panel h3')[1].textContent") == (
+            assert tab.ask("document.querySelectorAll('.panel h2')[1].textContent") == (
                 "Earlier actions most like GraspAction"
             )
             shown = tab.ask("[...document.querySelectorAll('.similar')].map((each) => each.innerText)")

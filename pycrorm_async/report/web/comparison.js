@@ -7,7 +7,7 @@ import { MapView } from "./map_view.js";
 import { SceneView } from "./scene_view.js";
 
 const LETTERS = ["A", "B"];
-const ROWS_MAX = 1000;
+const LISTED_MAX = 1000;
 const INDENT_PX = 14;
 const INDENTS_MAX = 12;
 const LONGER = 1.5; // so many times as long is marked,
@@ -133,7 +133,7 @@ class Comparison {
   #draw() {
     const marked = this.rows.filter(({ marks }) => marks.length > 0);
     const listed = this.all ? this.rows : this.rows.filter(({ holdsMark }) => holdsMark);
-    const shown = listed.slice(0, ROWS_MAX);
+    const shown = listed.slice(0, LISTED_MAX);
     const count = `${marked.length} of ${this.rows.length} nodes differ`;
     const toggle = element("button", { type: "button", "aria-pressed": String(this.all), onclick: () => this.#toggle() }, this.all ? "only what differs" : "all nodes");
     const heads = ["node", ...LETTERS, "differs"].map((each) => element("th", { scope: "col" }, each));
