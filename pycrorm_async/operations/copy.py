@@ -120,7 +120,11 @@ async def _open_target(address: DatabaseAddress, source: Source) -> AsyncIterato
         log.blobs.restores = isinstance(source, Lake)
         projector = Projector(log, installed=own_projections())
         await retry(projector.open, backoff=BRIEF)  # another copy may be creating the tables
-        yield log, LogAndTables(log, projector)
+        destination = LogAndTables(log, projector)
+        try:
+            yield log, destination
+        finally:
+            await destination.group.leave()
     finally:
         await log.close()
 
@@ -394,6 +398,8 @@ async def _fold(log: EventLog, row: EpisodeRow) -> bool:
         await retry(projector.open, backoff=BRIEF)
         while row.id in await destination.behind():
             await retry(destination.fold_next_batch, backoff=BRIEF)
+        return row.id not in await destination.stopped()
     except DatabaseError:
         return False
-    return row.id not in await destination.stopped()
+    finally:
+        await destination.group.leave()
