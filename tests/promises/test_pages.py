@@ -441,5 +441,5 @@ def test_the_page_of_the_command_names_every_verb_and_no_other(tmp_path: Path) -
     for verb in sorted(verbs):
         done = CliRunner().invoke(app(verb), [verb, "--help"])  # as the command does
         assert done.exit_code == 0
-        expected = {"spool": "repair", "copy": "--from", "ask": "root_failures", "examples": "FOLDER"}
+        expected = {"spool": "repair", "copy": "--from", "ask": "root_failures", "examples": "FOLDER", "lake": "query"}
         assert expected.get(verb, "--url") in done.stdout

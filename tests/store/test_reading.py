@@ -125,7 +125,7 @@ async def test_the_query_for_unfolded_episodes_reads_no_other_episode(file_log: 
         return " | ".join(row[3] for row in steps)
 
     compiled = dialect_of(file_log.engine).compile
-    behind = plan_of(compiled(schema.SELECT_BEHIND), 0, 9, 0)
+    behind = plan_of(compiled(schema.SELECT_BEHIND), 0, 1, 0, 9, 0)
     assert "episode_behind" in behind
     assert "TEMP B-TREE" not in behind
     spans = plan_of(sqlite.SELECT_SPAN, 1, 0, 9)
