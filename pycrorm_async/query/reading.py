@@ -104,7 +104,7 @@ class Reading:
         """Open the existing memory at a located address. Raises `DatabaseUnavailable` and `DatabaseForeign`."""
         reading = cls(address)
         try:
-            await reading.refresh()
+            await reading.refresh(maps=False)
             yield reading
         finally:
             await reading.close()
