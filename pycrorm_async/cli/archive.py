@@ -30,7 +30,7 @@ def archive(
 
     Their events are read back and compared before they leave the log and the tables. `pycrorm restore` brings them
     back, `pycrorm lake query` reads them in SQL. Episodes that are refused, parked or not visible yet stay. Run it
-    again after an interruption. It needs the extra [lake], and on PostgreSQL the login that owns log and tables.
+    again after an interruption. It needs the extra `lake`, and on PostgreSQL the login that owns log and tables.
     """
     if lake is None:
         raise CallerError("name the lake with --to ducklake:FOLDER")

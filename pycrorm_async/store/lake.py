@@ -99,6 +99,8 @@ def _parsed(address: str) -> tuple[str, str, str]:
         raise CallerError("a lake is named ducklake:FOLDER, or ducklake:postgresql://user@host/database#FOLDER")
     if place.startswith(("postgresql:", "postgres:")):
         return "postgres", place, data
+    if "://" in place:
+        raise CallerError(f"a lake has its catalog in a folder or on PostgreSQL, not at {place.partition('://')[0]}://")
     folder = Path(place).absolute()
     return "sqlite", f"{folder}/catalog.sqlite", data or f"{folder}/data"
 
@@ -301,12 +303,14 @@ class Lake:
         return {*names} - {name for (name,) in self.execute(query, [[*names]])}
 
     def erase(self, ids: Sequence[str]) -> None:
-        """Erase episodes, if the lake has them: write their files again without them, and delete the old ones."""
-        if not self.episode_rows(ids):
-            return
+        """Erase episodes: write the files again without them, and delete the old ones.
+
+        Does so too where a call that was killed has deleted their rows. Close the lake after an error.
+        """
         query = "SELECT type, encode(payload) FROM event WHERE episode IN (SELECT unnest(?)::UUID)"
         referring = self.execute(f"{query} AND contains(payload, '\"$blob\"')", [list(ids)])
         blobs = [each.hash for kind, payload in referring for each in references_in(kind, payload)]
+        self.execute("BEGIN")
         for table, key in (("event", "episode"), ("episode", "id")):
             self.execute(f"DELETE FROM {table} WHERE {key} IN (SELECT unnest(?)::UUID)", [list(ids)])
         referred = " AND ".join(
@@ -314,6 +318,7 @@ class Lake:
             for each in ("event", "declaration")
         )
         self.execute(f"DELETE FROM blob WHERE hash IN (SELECT unnest(?::VARCHAR[])) AND {referred}", [blobs])
+        self.execute("COMMIT")
         for call in (
             "ducklake_rewrite_data_files('lake', delete_threshold => 0)",
             "ducklake_expire_snapshots('lake', older_than => TIMESTAMP '9999-01-01')",
@@ -361,6 +366,8 @@ def query_lake(address: str, sql: str) -> tuple[tuple[str, ...], list[tuple[Any,
     with closing(open_lake(address)) as connection:
         try:
             answer = connection.execute(sql)
+            if answer is None:
+                raise QueryRefused(f"{shown(address)}: there is no query")
             return tuple(each[0] for each in answer.description), answer.fetchall()
         except import_module("duckdb").Error as error:
             raise QueryRefused(f"{shown(address)}: {_first_line(error, address)}") from error

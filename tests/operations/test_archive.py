@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import sqlite3
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.removal import erasable, erase
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.lake import Lake, query_lake
+from pycrorm_async.store.lake import Lake, erase_in_lake, query_lake
 from pycrorm_async.store.log import EventLog
 from tests.commands import pycrorm
 from tests.crash.forked_processes import ForkedProcess
@@ -159,6 +160,35 @@ async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp
     assert query_lake(lake, "SELECT count(*) FROM event")[1] == [(0,)]
 
 
+def erase_until(lake: str, episode: str, last: int) -> None:
+    """Erase an episode in a lake, and die after statement number `last`."""
+    execute, count = Lake.execute, 0
+
+    def die_after_last(self: Lake, sql: str, parameters: Sequence[object] = ()) -> list[tuple[object, ...]]:
+        nonlocal count
+        rows = execute(self, sql, parameters)
+        count += 1
+        if count == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return rows
+
+    Lake.execute = die_after_last  # type: ignore[method-assign]
+    erase_in_lake(lake, [episode])
+
+
+async def test_an_erasure_that_is_killed_at_any_step_is_finished_by_the_next(tmp_path: Path, lake: str) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    for last in (4, 6, 7, 8):
+        ids = await recorded(url, "first", SECRET)
+        await archived(url, lake)
+        process = ForkedProcess(erase_until, lake, ids[1], last)
+        assert process.wait() in (-9, 0), process.lines
+        await erased(url, ids[1])
+        files = [str(each) for each in (tmp_path / "lake/data/main/event").iterdir()]
+        query = f"SELECT count(*) FROM read_parquet({files}, union_by_name => true) WHERE episode = '{ids[1]}'"
+        assert query_lake(lake, query)[1] == [(0,)], last
+
+
 async def test_an_episode_that_differs_from_the_lake_stays_in_the_memory(tmp_path: Path, lake: str) -> None:
     url, other = put_memory(tmp_path / "memory.db"), put_memory(tmp_path / "other.db")
     await notes(url, "a")
@@ -181,12 +211,16 @@ async def test_bad_lakes_are_refused_in_one_line(tmp_path: Path, lake: str) -> N
         query_lake(lake, "SELECT 1")
     with pytest.raises(CallerError, match="a lake is named"):
         await archived(url, "s3:x")
+    with pytest.raises(CallerError, match=r"not at s3://$"):
+        await archived(url, "ducklake:s3://bucket/lake")
     (tmp_path / "file").write_text("")
     with pytest.raises(Exception, match=r"ducklake:.*file"):
         await archived(url, f"ducklake:{tmp_path}/file")
     await archived(url, lake)
     with pytest.raises(CallerError, match="read-only"):
         query_lake(lake, "DELETE FROM event")
+    with pytest.raises(CallerError, match="there is no query"):
+        query_lake(lake, "")
     source = Lake(lake, write=True)
     source.execute("INSERT INTO pycrorm_lake VALUES (99)")
     await source.close()
