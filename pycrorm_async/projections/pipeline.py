@@ -394,7 +394,9 @@ class FoldRunner:
                     if generation is None or not await self._write_rows(connection, batch, generation):
                         await savepoint.rollback()
         except (RowRefused, PycrormError):
-            return  # met again, and reported, when the companion folds by itself
+            if connection.invalidated:
+                raise  # the caller's transaction is lost too
+            # Otherwise met again, and reported, when the companion folds by itself.
 
     async def _lock_generation(
         self, connection: AsyncConnection, batch: _PreparedBatch, hold: generations.Hold = "share"

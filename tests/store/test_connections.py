@@ -18,6 +18,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.orm import Pose
+from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
@@ -25,6 +26,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.sqlite_engine import USE_WAL, Connection, _connect, make_engine
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from tests.databases import Server, ask
+from tests.projections.rebuild_cases import TYPES, picking
 from tests.store.factories import cancel_at_await
 
 # === connection pool ==========================================================================================
@@ -262,3 +264,20 @@ async def test_a_connection_that_breaks_while_replaced_views_are_dropped_is_repo
         await Projector(log, views=[UserView("heights", select(Pose.z))]).open()
         await log.close()
     assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname LIKE 'memory%'") == [(2,)]
+
+
+@pytest.mark.slow
+async def test_a_connection_that_breaks_while_cases_are_written_is_reported_as_such(server: Server) -> None:
+    async with proxy_before(server.folder) as proxy:
+        log = await opened(proxy, server.new_memory())
+        projector = Projector(log, installed=own_projections())
+        await projector.open()
+        await log.append([*TYPES, *picking(1).records])
+        await projector.catch_up()
+        await log.append(picking(2).records)
+        proxy.cut_before(b"SAVEPOINT")
+        with pytest.raises(DatabaseUnavailable):
+            await projector.catch_up()
+        assert proxy.faults == 1
+        assert await projector.catch_up() > 0
+        await log.close()
