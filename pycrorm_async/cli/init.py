@@ -6,10 +6,11 @@ Panel: Operate, 0.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Annotated
 
 import typer
+from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.cli.output import JsonOption, print_json, stdout
 from pycrorm_async.cli.reading import Place
@@ -49,15 +50,17 @@ def init(
     question about one episode reads one partition of each table. To partition a memory that exists, create a new one
     and copy the episodes into it (`pycrorm copy`). Repeating the command changes nothing.
     """
-    address, placement = (
-        place.shared_address,
-        Placement.of(partitions, tuple(DatabaseAddress.parse(each).as_shard() for each in shard or [])),
-    )
+    address, shards = place.shared_address, [shared_address(each) for each in shard or []]
+    placement = Placement.of(partitions, tuple(each.as_shard() for each in shards))
     if address.is_sqlite and placement != PLAIN:
         raise CallerError(
             f"{address} is one file, which has no partitions: name a PostgreSQL database, or leave them out"
         )
-    asyncio.run(_create(address, placement, [shared_address(each) for each in shard or []]))
+    for each in shards:
+        if each.is_sqlite or each.as_shard() == address.as_shard():
+            what = "a file" if each.is_sqlite else "the database of the memory itself"
+            raise CallerError(f"--shard {each} is {what}: name a database on another PostgreSQL server")
+    asyncio.run(_create(address, placement, shards))
     if as_json:
         print_json({"url": address.to_type, "placement": placement.to_print()})
     else:
@@ -85,13 +88,17 @@ async def _make_shards(coordinator: DatabaseAddress, shards: Sequence[DatabaseAd
     """Create the tables of events on the shards of a new memory, if the coordinator can use them."""
     from pycrorm_async.store import postgresql  # the driver takes long to load
 
-    for place in (coordinator, *shards):
+    async def asked(place: DatabaseAddress, step: Callable[[AsyncEngine, str], Awaitable[bool | None]]) -> bool | None:
         engine = place.engine()
         try:
             with dialect_of(engine).translated(str(place)):
-                if place is not coordinator:
-                    await postgresql.make_shard(engine, str(place))
-                elif not await postgresql.needs_shards(engine, str(place)):
-                    return
+                return await step(engine, str(place))
         finally:
             await engine.dispose()
+
+    if not await asked(coordinator, postgresql.needs_shards):
+        return
+    # Each is asked before the first one is changed, so that the command can be repeated.
+    for step in (postgresql.must_be_free, postgresql.make_shard):
+        for each in shards:
+            await asked(each, step)

@@ -214,8 +214,9 @@ class LogAndTables:
             return count + await self._projector.catch_up()
 
     async def _fold_by_share(self) -> int:
-        """Fold this process' share, and wait for the others to fold theirs; stop when none of them has for a while."""
+        """Fold this process' share of what is behind now, and wait for the others to fold theirs, while these do."""
         count, moved_s = 0, time.monotonic()
+        heads = {each.id: each.head for each in await self._episodes_behind()}  # others may append more all the time
         behind: Mapping[str, int] = {}
         try:
             while True:
@@ -224,7 +225,8 @@ class LogAndTables:
                 if folded is not None:
                     count, moved_s = count + folded, time.monotonic()
                     continue
-                before, behind = behind, await self.behind()
+                now = await self.behind()
+                before, behind = behind, {each: at for each, at in now.items() if at < heads.get(each, 0)}
                 moved_s = time.monotonic() if before != behind else moved_s
                 if not behind or time.monotonic() > moved_s + _OTHERS_S:
                     return count
@@ -254,8 +256,10 @@ class LogAndTables:
             raise
 
     async def behind(self) -> Mapping[str, int]:
-        behind = await self.group.read(EpisodeRow, SELECT_BEHIND, after=0, limit=EPISODE_NUMBER_MAX, **WHOLE._asdict())
-        return {each.id: each.folded for each in behind}
+        return {each.id: each.folded for each in await self._episodes_behind()}
+
+    async def _episodes_behind(self) -> list[EpisodeRow]:
+        return await self.group.read(EpisodeRow, SELECT_BEHIND, after=0, limit=EPISODE_NUMBER_MAX, **WHOLE._asdict())
 
     async def stopped(self) -> Mapping[str, str]:
         stopped = await self.group.read(EpisodeRow, SELECT_STOPPED)

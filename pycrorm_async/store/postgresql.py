@@ -558,18 +558,24 @@ def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], .
 # === shards ===================================================================================================
 
 
-async def make_shard(engine: AsyncEngine, name: str) -> None:
-    """Create the table of events on a shard. Raises `CallerError` if the database is a shard already."""
-    log = _DIALECT.definition(schema.EVENT)
-    # Also the name of the setting that permits a deletion (`placement`).
-    statements = [each.replace(f"{LOG}.", f"{SHARD_SCHEMA}.") for each in (_REFUSAL, *log)]
-    async with engine.begin() as connection:
+async def must_be_free(engine: AsyncEngine, name: str) -> None:
+    """Raise `CallerError` if the database is a shard already."""
+    async with engine.connect() as connection:
         exists = "SELECT pg_catalog.to_regnamespace($1::text) IS NOT NULL"
         if (await connection.exec_driver_sql(exists, (SHARD_SCHEMA,))).scalar_one():
             raise errors.CallerError(
                 f"{name} has a schema {SHARD_SCHEMA} already: name another database, or drop the schema if no memory"
                 " keeps events in it"
             )
+
+
+async def make_shard(engine: AsyncEngine, name: str) -> None:
+    """Create the table of events on a shard. Raises as `must_be_free` does: two URLs may name one database."""
+    await must_be_free(engine, name)
+    log = _DIALECT.definition(schema.EVENT)
+    # Also the name of the setting that permits a deletion (`placement`).
+    statements = [each.replace(f"{LOG}.", f"{SHARD_SCHEMA}.") for each in (_REFUSAL, *log)]
+    async with engine.begin() as connection:
         await _DIALECT.execute_all(connection, [f"CREATE SCHEMA {SHARD_SCHEMA}", *statements])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import random
 import signal
 from collections.abc import AsyncIterator
@@ -127,6 +128,28 @@ async def test_a_flush_makes_all_visible_whoever_else_is_in_the_group(
         assert await folder.fold() == len({*range(count, 2 * count)} - ({*range(5, 10)} if count == 30 else set()))
         assert await folder.behind() == {}
         assert await shares_of([idle]) == [WHOLE]  # the other one has left
+
+
+async def test_a_flush_ends_while_others_append_and_one_does_not_fold(
+    folders: list[LogAndTables], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, idle, recording = folders
+    await shares_of([idle])
+    monkeypatch.setattr("pycrorm_async.operations.destination.LOOKAHEAD_EVENTS_MIN", 10)
+    await recording.append([started(each) for each in range(1, 31)])
+    await folder.group.share()  # from now on half of the episodes are of the idle one
+
+    async def append_repeatedly() -> None:
+        for each in itertools.count(31):
+            await recording.append([started(each)])
+            await asyncio.sleep(0.5)
+
+    appending = asyncio.create_task(append_repeatedly())
+    try:
+        async with asyncio.timeout(30):
+            assert await folder.fold() >= 30
+    finally:
+        appending.cancel()
 
 
 def test_a_share_is_stalled_if_none_of_its_episodes_has_moved() -> None:

@@ -89,6 +89,9 @@ def test_what_cannot_have_shards_is_refused_in_one_line(server: Server, coordina
         (("--shard", free, "--url", "sqlite:///new.db"), 2, "is one file"),
         (("--shard", free, "--shard", free, "--url", url), 2, "named twice"),
         (("--shard", free, "--partitions", "4", "--url", url), 2, "exclude each other"),
+        (("--shard", url, "--url", url), 2, "is the database of the memory itself"),
+        (("--shard", "sqlite:///new.db", "--url", url), 2, "is a file"),
+        (("--shard", free, "--shard", server.url("missing"), "--url", url), 3, "does not exist"),
         (("--shard", server.url("missing"), "--url", url), 3, "does not exist"),
     ):
         done = pycrorm("init", *words, cwd=tmp_path)
