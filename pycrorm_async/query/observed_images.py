@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, Literal, NamedTuple
@@ -126,7 +127,7 @@ def array_of(content: bytes) -> NDArray[Any]:
     """Return a recorded array. Raises `ValueError`."""
     try:
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError, SyntaxError, MemoryError) as error:
+    except Exception as error:  # noqa: BLE001  numpy raises many kinds for a header that is damaged
         raise ValueError(f"it is no array: {error}") from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         raise ValueError("it is no array of numbers")
@@ -169,7 +170,7 @@ def colored(depth: NDArray[Any]) -> NDArray[np.uint8]:
     return pixels
 
 
-def smaller(pixels: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+def smaller(pixels: NDArray[Any], side: int) -> NDArray[Any]:
     """Return every n-th pixel, so that neither side is longer than `side`."""
     step = max(1, -(-max(pixels.shape[:2]) // side))
     return pixels[::step, ::step]
@@ -189,7 +190,7 @@ def png_of(pixels: NDArray[np.uint8], level: int = 6) -> bytes:
 
 
 def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
-    """Return a smaller JPEG of an encoded image or of pixels.
+    """Return a smaller JPEG of an encoded image or of pixels; one of 16 bits is coloured as a depth map.
 
     Raises `ValueError` for what is no image, and for one of more than 50 million pixels; `ImportError` without Pillow.
     """
@@ -197,10 +198,13 @@ def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
 
     try:
         if isinstance(image, bytes):
-            opened: Any = Image.open(io.BytesIO(image), formats=("PNG", "JPEG", "GIF", "WEBP"))
+            with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
+                opened: Any = Image.open(io.BytesIO(image), formats=("PNG", "JPEG", "GIF", "WEBP"))
             if opened.width * opened.height > _PIXELS_MAX:
                 raise ValueError(f"it has {opened.width} x {opened.height} pixels, more than {_PIXELS_MAX:,}")
             opened.draft("RGB", (side, side))
+            if opened.mode[0] == "I":  # 16 bits are the depths of a camera
+                opened = Image.fromarray(colored(smaller(np.asarray(opened), side)))
         else:
             opened = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image)
         opened.thumbnail((side, side))
@@ -225,10 +229,13 @@ def points_of(content: Content, data: bytes) -> NDArray[np.float32]:
     points = table[:, :3].astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     match content.around.get("pose"):
-        case {"position": [_, _, _] as position, "orientation": [x, y, z, w]}:
-            axis = np.array([x, y, z], float)
+        case {"position": [_, _, _] as position, "orientation": [_, _, _, _] as orientation}:
+            try:
+                place, (*axis, w) = np.array(position, float), np.array(orientation, float)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise ValueError(f"the pose beside it has no numbers: {error}") from None
             turned = np.cross(axis, points)
-            points = points + 2 * (w * turned + np.cross(axis, turned)) + np.array(position, float)
+            points = points + 2 * (w * turned + np.cross(axis, turned)) + place
     return points[(np.abs(points) < _FARTHEST_M).all(axis=1)].astype(np.float32)
 
 

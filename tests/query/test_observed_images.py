@@ -132,7 +132,38 @@ def test_a_file_that_is_no_cloud_has_a_reason_and_no_traceback(data: bytes) -> N
             points_of(content, data)
 
 
-@pytest.mark.parametrize("data", [b"", b"GIF", npy(np.zeros(9))[:90], npy(np.array(["text"])), b"\x93NUMPY\x01\x00"])
+@pytest.mark.parametrize("number", [None, "x", {}, 10**400])
+def test_a_pose_without_numbers_is_a_reason(number: Any) -> None:
+    for pose in (
+        {"position": [0, 0, 0], "orientation": [0, 0, 0, number]},
+        {"position": [number, 0, 0], "orientation": [0, 0, 0, 1]},
+    ):
+        content = content_of({"pose": pose, "cloud": reference(NPY, POINTS)})
+        if number is None:
+            assert points_of(content, npy(POINTS)).tolist() == []
+        else:
+            with pytest.raises(ValueError, match="the pose beside it has no numbers"):
+                points_of(content, npy(POINTS))
+
+
+def headed(header: bytes) -> bytes:
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"GIF",
+        npy(np.zeros(9))[:90],
+        npy(np.array(["text"])),
+        b"\x93NUMPY\x01\x00",
+        b"PK\x03\x04 no archive",
+        headed(b"{'descr': ("),
+        headed(b"{1: 2, 'a': 3}"),
+        headed(b"{'descr': '<f4', 'fortran_order': False, 'shape': (%d, 3), }" % 10**30),
+    ],
+)
 def test_a_content_that_is_no_array_and_no_image_has_a_reason(data: bytes) -> None:
     with pytest.raises(ValueError, match="it is no array"):
         array_of(data)
@@ -145,9 +176,23 @@ def test_a_small_file_that_claims_many_pixels_is_refused() -> None:
     from pycrorm_async.query.observed_images import jpeg_of
 
     bomb = png_of(np.zeros((1, 1, 3), np.uint8))
-    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
-    crc = struct.pack(">I", zlib.crc32(b"IHDR" + header))
-    with pytest.raises(ValueError, match=r"pixels|decompression"):
-        jpeg_of(bomb[:16] + header + crc + bomb[33:], 100)
+    for side in (100_000, 10_000):
+        header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+        crc = struct.pack(">I", zlib.crc32(b"IHDR" + header))
+        with pytest.raises(ValueError, match=r"pixels|decompression"):
+            jpeg_of(bomb[:16] + header + crc + bomb[33:], 100)
     with pytest.raises(ValueError, match="it cannot be decoded"):
         jpeg_of(b"\xff\xd8\xffnot really", 100)
+
+
+def test_an_encoded_image_of_16_bits_is_a_depth_map() -> None:
+    image = pytest.importorskip("PIL.Image")
+    from pycrorm_async.query.observed_images import jpeg_of
+
+    file, depth = io.BytesIO(), np.zeros((64, 64), np.uint16)
+    depth[:, 32:] = 4_000
+    image.fromarray(depth).save(file, "PNG")
+    seen = np.asarray(image.open(io.BytesIO(jpeg_of(file.getvalue(), 32)))).astype(int)
+    assert seen.shape == (32, 32, 3)
+    assert np.abs(seen[16, 4] - [68, 1, 84]).max() < 12
+    assert np.abs(seen[16, 28] - [253, 231, 37]).max() < 12
