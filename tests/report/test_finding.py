@@ -28,7 +28,7 @@ def _record(folder: Path) -> None:
         drive = recording.type("action", "NavigateAction", {"target": "pose"})
         pick = recording.type("action", "PickUpAction", {"arm": "text", "grip": "object", "poses": ("list", "real")})
         move = recording.type("motion", "MoveTCPMotion", {"speed": "real"})
-        with recording.episode(description="Two robots carry a parcel") as episode:
+        with recording.episode(description="Two robots carry a parcel", plan="carry_" * 60) as episode:
             episode.object_added("one", "agv-1", "ROBOT", Pose([0, 0, 0]))
             episode.object_added("two", HOSTILE, "ROBOT", Pose([1, 1, 0]))
             episode.object_added("parcel", "parcel", "GENERIC_OBJECT", Pose([2, 0, 1]))
@@ -52,15 +52,19 @@ def _record(folder: Path) -> None:
             episode.object_added("one", "agv-1", "ROBOT", Pose([0, 0, 0]))
             episode.start("pick", pick, {}, robot="one")
             episode.start("move", move, {"speed": 0.5}, parent="pick", robot="one")
+            episode.end("move", failure=("IKError", "cannot reach " * 200))
         memory.flush()
-    for number in (1, 2):
+    for number in (1, 2, 3):
         done = pycrorm("report", str(number), "--url", "sqlite:///fleet.db", "--out", f"{number}.html", cwd=folder)
+        assert done.returncode == 0, done.stderr
+    for command in (("report", "--all", "--out", "all.html"), ("diff", "1", "3", "--html", "diff.html")):
+        done = pycrorm(*command, "--url", "sqlite:///fleet.db", cwd=folder)
         assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the pages of an episode of two robots, and of one of a single node without a world."""
+    """Return a folder with pages: of an episode of two robots, one of a single node without a world, all, and two."""
     return made_once(tmp_path_factory, "fleet", _record)
 
 
@@ -251,12 +255,15 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_axe_finds_nothing_critical_or_serious(
     chrome: Browser, fleet: Path, pages: dict[str, Path], axe: str, dark: bool, width: int
 ) -> None:
-    for page in (fleet / "1.html", fleet / "2.html", pages["plan"]):
-        with chrome.open(page, width=width, dark=dark, fragment="#e20") as tab:
+    names = "globalThis.pycrormPage?.panels.tabs.map(([name]) => name) ?? ['the whole']"
+    opening = "globalThis.pycrormPage?.panels.open('{}')"
+    serious = "axe.run().then(({ violations }) => violations.map(({ impact, id }) => [impact, id]))"
+    shown = [fleet / f"{each}.html" for each in ("1", "2", "3", "all", "diff")]
+    for page in (*shown, pages["plan"]):
+        fragment = "#by=robot&vs=agv-1&vs=none" if page.name == "all.html" else "#e20"
+        with chrome.open(page, width=width, dark=dark, fragment=fragment) as tab:
             tab.ask(f"{axe}; 0")
-            for name in tab.ask("pycrormPage.panels.tabs.map(([name]) => name)"):
-                tab.ask(f"pycrormPage.panels.open('{name}')")
-                violations = tab.ask(
-                    "axe.run().then(({ violations }) => violations.map(({ impact, id }) => [impact, id]))"
-                )
-                assert [each for each in violations if each[0] in ("critical", "serious")] == [], name
+            for name in tab.ask(names):
+                tab.ask(opening.format(name))
+                found = [each for each in tab.ask(serious) if each[0] in ("critical", "serious")]
+                assert found == [], (page.name, name)

@@ -35,6 +35,7 @@ def observe(url: str, count: int, side: int = 64, *, world: bool = True) -> None
             episode.observe("depth", depth)
             episode.observe("lidar", np.random.default_rng(0).random((9_000, 3)).astype(np.float32))
             episode.observe("fake", Blob(b"<svg onload=alert(1)>", "image/png"))
+            episode.observe("broken", Blob(picture(0)[:8] + b"nothing", "image/png"))
             episode.observe("torn", Blob(picture(0)[:100], "image/png"))
             episode.observe("sound", Blob(b"1234", "audio/wav"))
             episode.observe("no array", np.full((90, 90), np.nan))
@@ -63,12 +64,13 @@ async def test_a_document_has_pictures_once_and_the_reasons_of_those_that_are_no
         "lidar": ("points", "9,000 points", None),
         "fake": ("image", None, "it is no PNG, JPEG, GIF or WebP image"),
         "torn": ("image", "whole", None),  # a browser says what it shows of a small one
+        "broken": ("image", "whole", None),
         "no array": ("depth", None, "it has no finite number"),
     }
     assert document["contents"][0].startswith("data:image/jpeg;base64,")
     assert document["unpictured"] == 0
     assert (await document_of(url, "none"))["contents"] == []
-    assert (await document_of(url, "none"))["unpictured"] == 7
+    assert (await document_of(url, "none"))["unpictured"] == 8
     whole = await document_of(url, "full")
     assert [each.get("text") for each in whole["pictures"]][:3] == ["whole", "whole", "whole, 0.5 to 2"]
     assert whole["contents"][0].startswith("data:image/png;base64,")
@@ -116,6 +118,7 @@ async def test_the_page_shows_the_picture_of_the_moment_on_the_axis_beside_the_s
         assert f"{HOSTILE} rgb" in tab.ask(SHOWN)
         assert "depth 0.5 to 2" in tab.ask(SHOWN)
         assert "it is no PNG" in tab.ask("document.getElementById('seen').textContent")
+        tab.wait_for("document.getElementById('seen').textContent.includes('not readable')")
         assert tab.ask("pycrormPage.view.clouds.children[0].geometry.attributes.position.count") == 4_500
         first = tab.ask("pycrormPage.episode.cameras.values().next().value[2].at")
         tab.ask(f"pycrormPage.seek({first})")

@@ -62,7 +62,7 @@ export class Groups {
 
   show(episodes) {
     const { settings } = this;
-    const by = settings.get("by") in GROUPINGS ? settings.get("by") : "";
+    const by = Object.hasOwn(GROUPINGS, settings.get("by")) ? settings.get("by") : "";
     const kinds = Object.keys(GROUPINGS).filter((each) => each === by || each in IN_TIME || episodes.some((other) => GROUPINGS[each](other).length > 0));
     offer(this.by, [["", "no groups"], ...kinds.map((each) => [each, `by ${each}`])]);
     this.by.value = by;
@@ -131,7 +131,7 @@ function comparison([[name, one], [otherName, other]]) {
   const note = "The difference is that of the second to the first, with its 95 % interval; it is bold where that leaves out 0. Times are the median of episodes and the mean of actions.";
   return [
     element("h3", {}, recorded(name), " beside ", recorded(otherName)),
-    element("div", { class: "scrolled" }, element("table", {}, heads("succeeded"), element("tbody", {}, ...rows), causes.length > 0 ? heads("episodes that failed by") : null, element("tbody", {}, ...causes))),
+    element("div", { class: "scrolled", tabindex: 0 }, element("table", {}, heads("succeeded"), element("tbody", {}, ...rows), causes.length > 0 ? heads("episodes that failed by") : null, element("tbody", {}, ...causes))),
     element("p", { class: "quiet" }, note),
   ];
 }

@@ -8,9 +8,13 @@ const LISTED_MAX = 200;
 const MESSAGES_MAX = 5;
 const LINKS_MAX = 12;
 const VALUE_MAX = 60;
+const [LONG, LINES_OF_LONG] = [400, 10];
 const CONTENT = /\{"\$blob":"[^"]*","media_type":"([^"]*)","size":(\d+)[^{}]*\}/g;
 
 const listOf = (facts) => element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+
+/** A text that may be long; the keys reach one that may scroll. */
+const long = (text) => ({ class: "long", tabindex: text.length > LONG || text.split("\n").length > LINES_OF_LONG ? 0 : null });
 
 const unsigned = (text) => (Number(text) === 0 ? text.replace("-", "") : text);
 
@@ -121,10 +125,10 @@ export class Panels {
       ["took", this.#took(node)],
       ["robot", node.robot ? recorded(node.robot) : null],
       ["parameters", node.parameters ? this.#parameters(node) : null],
-      ["result", node.result ? recorded(node.result, { class: "long" }) : null],
+      ["result", node.result ? recorded(node.result, long(node.result)) : null],
       ["reason", node.reason ? recorded(node.reason) : null],
       ["then", node.outcome],
-      ["message", node.message ? recorded(node.message, { class: "long" }) : null],
+      ["message", node.message ? recorded(node.message, long(node.message)) : null],
       ["part of", node.parent ? this.#node(node.parent.start) : null],
     ].filter(([, value]) => value !== null);
     const list = listOf(facts);
@@ -145,7 +149,7 @@ export class Panels {
   }
 
   #parameters(node) {
-    const rows = node.pairs.map(([name, value]) => element("tr", {}, element("th", { scope: "row" }, recorded(name)), element("td", {}, recorded(value, { class: "long" }))));
+    const rows = node.pairs.map(([name, value]) => element("tr", {}, element("th", { scope: "row" }, recorded(name)), element("td", {}, recorded(value, long(value)))));
     return element("table", {}, element("tbody", {}, ...rows));
   }
 
@@ -185,7 +189,7 @@ export class Panels {
       const shown = messages.slice(0, MESSAGES_MAX).flatMap((alike) => {
         const links = alike.slice(0, LINKS_MAX).map((each) => this.#nodeMoment(each));
         const left = alike.length > LINKS_MAX ? ` and ${alike.length - LINKS_MAX} like it` : "";
-        const text = element("p", { class: "long" }, recorded(alike[0].message));
+        const text = element("p", long(alike[0].message), recorded(alike[0].message));
         if (alike.length === 1) return [text, element("p", {}, ...links)];
         return [text, this.#compared(alike.slice(0, LINKS_MAX), links), left ? element("p", {}, left) : null];
       });

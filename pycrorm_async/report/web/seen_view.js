@@ -117,7 +117,8 @@ export class SeenView {
   }
 }
 
-const imageOf = (picture) => element("img", { src: picture.source, alt: "", decoding: "async" });
+/** The image of a picture, or a word in its place if the browser cannot decode it. */
+const imageOf = (picture) => element("img", { src: picture.source, alt: "", decoding: "async", onerror: ({ target }) => target.replaceWith("not readable") });
 
 /** The clouds of the moment: of each name the latest one. */
 export function cloudsAt(episode, event) {
