@@ -349,7 +349,8 @@ def digest_after(running: RunningDigest, events: Sequence[StoredEvent]) -> str:
 
 
 def erase_in_lake(address: str, ids: Sequence[str]) -> None:
-    """Erase episodes in a lake, also from the free pages of a catalog in a file."""
+    """Erase episodes in a lake, which has to be there, also from the free pages of a catalog in a file."""
+    open_lake(address).close()  # makes none: a folder that is not mounted still holds them
     lake = Lake(address, write=True)
     try:
         lake.erase(ids)

@@ -141,6 +141,10 @@ async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp
     ids = await recorded(url, "first", SECRET)
     await archived(url, lake)
     folder = tmp_path / "lake"
+    folder.rename(tmp_path / "away")
+    with pytest.raises(DatabaseUnavailable, match="there is no lake"):
+        await erased(url, ids[1])
+    (tmp_path / "away").rename(folder)
     [done] = await erased(url, ids[1])
     assert (done.left, done.removed.archived_in) == ((), None)
     files = [each for each in folder.rglob("*") if each.is_file()]
