@@ -90,7 +90,9 @@ async def claimed(log: EventLog) -> AsyncIterator[None]:
     with log.translated():
         async with dialect_of(log.engine).claim(log.engine) as claim:
             if not claim:
-                raise CallerError(f"{log.address}: another `pycrorm rebuild` is running: wait for it to end")
+                raise CallerError(
+                    f"{log.address}: a `pycrorm rebuild` or `pycrorm archive` is running: wait for it to end"
+                )
             yield
 
 

@@ -333,7 +333,7 @@ async def test_a_second_rebuild_is_refused_with_one_line(database_url: str, tmp_
         done = await asyncio.to_thread(pycrorm, "rebuild", "--url", database_url, cwd=tmp_path)
     await log.close()
     assert done.returncode == 2
-    assert one_line_of(done).endswith("another `pycrorm rebuild` is running: wait for it to end")
+    assert one_line_of(done).endswith("a `pycrorm rebuild` or `pycrorm archive` is running: wait for it to end")
 
 
 def start_rebuild(folder: Path, workers: str) -> subprocess.Popen[str]:
