@@ -340,7 +340,9 @@ def _picture(when: ReplayTime, name: str, content: Content, data: bytes) -> Pict
     if content.kind == "points":
         return Picture(when, name, "points", observed_images.points_of(content, data))
     if content.kind == "depth":
-        return Picture(when, name, "depth", observed_images.array_of(data))
+        depth = observed_images.array_of(data)
+        observed_images.range_of(depth)  # refuses one without a finite number
+        return Picture(when, name, "depth", depth.view(np.uint8) if depth.dtype.kind == "b" else depth)
     if content.media_type.startswith("image/"):
         observed_images.image_type(data)
         return Picture(when, name, "image", data)

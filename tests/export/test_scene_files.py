@@ -239,6 +239,8 @@ async def seen(tmp_path: Path) -> AsyncIterator[Reading]:
             episode.observe("pixels", PIXELS)
             episode.observe("lidar", np.arange(300, dtype=np.float32).reshape(100, 3))
             episode.observe("fake", Blob(b"no image", "image/png"))
+            episode.observe("nothing", np.full((20, 20), np.nan))
+            episode.observe("mask", np.eye(20, dtype=bool))
         memory.flush()
     async with Reading.open(url) as reading:
         yield reading
@@ -252,10 +254,12 @@ async def test_an_mcap_file_has_what_was_observed_and_the_joints(
 ) -> None:
     await export(seen, 1, tmp_path / "seen.mcap")
     assert "fake is left out: it is no PNG" in caplog.text
+    assert "nothing is left out: it has no finite number" in caplog.text
     by_topic = {topic: content for topic, _, _, content in messages_of(tmp_path / "seen.mcap")}
     assert by_topic.keys() - {"/tf", "/scene", "/plan"} == {
         "/camera/head_camera.rgb",
         "/camera/depth",
+        "/camera/mask",
         "/camera/pixels",
         "/cloud/lidar",
         "/joint_states/agv",
