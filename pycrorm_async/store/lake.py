@@ -363,12 +363,13 @@ def erase_in_lake(address: str, ids: Sequence[str]) -> None:
 
 
 def query_lake(address: str, sql: str) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
-    """Return the columns and the rows of a query. Raises `QueryRefused` for a wrong one."""
+    """Return the columns and the rows of one query. Raises `QueryRefused` for a wrong one, and for what may change."""
     with closing(open_lake(address)) as connection:
         try:
-            answer = connection.execute(sql)
-            if answer is None:
-                raise QueryRefused(f"{shown(address)}: there is no query")
+            statements = connection.extract_statements(sql)
+            if [each.type.name for each in statements] not in (["SELECT"], ["EXPLAIN"]):
+                raise QueryRefused(f"{shown(address)}: give one query that only reads, such as SELECT")
+            answer = connection.execute(statements[0])
             return tuple(each[0] for each in answer.description), answer.fetchall()
         except import_module("duckdb").Error as error:
             raise QueryRefused(f"{shown(address)}: {_first_line(error, address)}") from error

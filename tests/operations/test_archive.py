@@ -221,10 +221,19 @@ async def test_bad_lakes_are_refused_in_one_line(tmp_path: Path, lake: str) -> N
     with pytest.raises(Exception, match=r"ducklake:.*file"):
         await archived(url, f"ducklake:{tmp_path}/file")
     await archived(url, lake)
-    with pytest.raises(CallerError, match="read-only"):
-        query_lake(lake, "DELETE FROM event")
-    with pytest.raises(CallerError, match="there is no query"):
-        query_lake(lake, "")
+    catalog, file = Path(lake.removeprefix("ducklake:")) / "catalog.sqlite", tmp_path / "written"
+    for statement in (
+        "DELETE FROM event",
+        "",
+        f"ATTACH '{catalog}' AS c",
+        f"COPY event TO '{file}'",
+        "SELECT 1; SELECT 2",
+    ):
+        with pytest.raises(CallerError, match="give one query that only reads"):
+            query_lake(lake, statement)
+    assert not file.exists()
+    assert query_lake(lake, "SELECT now() > TIMESTAMP '2000-01-01'")[1] == [(True,)]
+    assert query_lake(lake, "SELECT now()")[1]
     source = Lake(lake, write=True)
     source.execute("INSERT INTO pycrorm_lake VALUES (99)")
     await source.close()
