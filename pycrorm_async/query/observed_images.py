@@ -161,11 +161,12 @@ def range_of(depth: NDArray[Any]) -> tuple[float, float]:
 def colored(depth: NDArray[Any]) -> NDArray[np.uint8]:
     """Return the pixels of a depth map: dark blue is the least value, yellow the greatest, black what is not finite."""
     low, high = range_of(depth)
-    share = (depth.astype(np.float64) - low) / ((high - low) or 1.0)
-    places = np.clip(np.nan_to_num(share, nan=0.0), 0, 1)
+    share = (depth.astype(np.float32) - np.float32(low)) / np.float32((high - low) or 1.0)
+    levels = (np.clip(np.nan_to_num(share, nan=0.0), 0, 1) * 255).round().astype(np.uint8)
     anchors = np.array(_VIRIDIS, float)
-    channels = [np.interp(places, np.linspace(0, 1, len(anchors)), anchors[:, each]) for each in range(3)]
-    pixels = np.stack(channels, axis=-1).round().astype(np.uint8)
+    at = np.linspace(0, 1, len(anchors))
+    table = np.stack([np.interp(np.linspace(0, 1, 256), at, anchors[:, each]) for each in range(3)], axis=-1)
+    pixels: NDArray[np.uint8] = table.round().astype(np.uint8)[levels]  # a table, because a map may have 64 million values
     pixels[~np.isfinite(depth)] = 0
     return pixels
 
