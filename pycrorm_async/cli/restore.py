@@ -22,7 +22,7 @@ def restore(
     place: Place,
     form: Form,
 ) -> int:
-    """Append episodes of a lake to the memory, each under the number that it had there, and fold them.
+    """Bring episodes of a lake back into the memory, each under the number that it had there, and fold them.
 
     They stay in the lake. It is safe to repeat: events that are there are compared. An episode that the memory has
     erased is refused. `pycrorm copy --from LAKE --to URL` does the same with all episodes.

@@ -166,7 +166,7 @@ def colored(depth: NDArray[Any]) -> NDArray[np.uint8]:
     anchors = np.array(_VIRIDIS, float)
     at = np.linspace(0, 1, len(anchors))
     table = np.stack([np.interp(np.linspace(0, 1, 256), at, anchors[:, each]) for each in range(3)], axis=-1)
-    pixels: NDArray[np.uint8] = table.round().astype(np.uint8)[levels]  # a table, because a map may have 64 million values
+    pixels: NDArray[np.uint8] = table.round().astype(np.uint8)[levels]  # a map may have 64 million values
     pixels[~np.isfinite(depth)] = 0
     return pixels
 

@@ -73,6 +73,7 @@ def test_an_intact_memory_is_reported_as_such(folder: Path) -> None:
         "episodes": 3, "events": 60, "rows": rows, "behind": 0, "damage": 0, "drift": 0, "remarks": 0,
         "damages": [], "differences": [], "not_compared": {}, "stopped": [], "unmade": {}, "outdated": None,
         "failed_views": {}, "blobs": 0, "without_digest": 0, "deleted": [], "rows_without_event": 0, "undecided": 0,
+        "erased": 0, "archived": 0,
     }  # fmt: skip
 
 

@@ -32,12 +32,13 @@ FORMS = [
     "export 1 --out {OUT}.jsonl", "export 1 3 --format lerobot --out {OUT}", "export 1 --out {OUT}.rrd",
     "export 1 2 3 --out {OUT}.parquet", "export 1 --out {OUT}.mcap",
     "copy --to sqlite:///{OUT}.db", "copy --to sqlite:///{OUT}2.db --json", "rebuild",
-    "datasette-metadata", "spool inspect --json", "watch 1 --terminal",
+    "datasette-metadata", "erase 1 --reason {BAD} --dry-run", "erase", "spool inspect --json", "watch 1 --terminal",
     *(f"ask {each}" for each in ("root_failures", "failures_by_cause", "steps_before_failures", "longest_actions")),
     *(f"ask {each}" for each in ("durations", "arms_used", "successful_pick_ups", "episodes")),
     "ask root_failures --json", "ask object_history --name MILK", "ask moves_of --name MILK",
 ]  # fmt: skip
-NOT_TRIED = {"demo", "import", "run", "learn", "plot", "mcp", "roles", "writer"}
+NOT_TRIED = {"demo", "import", "run", "learn", "plot", "mcp", "roles", "writer", "init", "examples"}
+NOT_TRIED |= {"archive", "lake", "restore"}  # their lines are those of `copy`, `query` and `erase`
 """Verbs that record, serve agents (`tests/integrations/mcp`), draw pictures only or print none of what is recorded."""
 
 

@@ -41,7 +41,7 @@ def test_an_object_is_chosen_by_a_click_in_the_scene_or_in_the_list(chrome: Brow
         chosen = "[...document.querySelectorAll('.panel tr.lit td')].map((each) => each.textContent)"
         assert tab.ask(chosen) == ["cereal", "BREAKFAST_CEREAL", "1.300", "0.700", "0.950", "0", ""]
         tab.ask("[...document.querySelectorAll('.panel button')].find((each) => each.textContent === 'milk').click()")
-        assert tab.ask(chosen) == ["milk", "MILK", "1.300", "1.000", "0.900", "0", "pr2"]
+        assert tab.ask(chosen) == ["milk", "MILK", "1.300", "1.000", "0.900", "0", "pr2, left arm"]
         tab.press("Escape")
         assert tab.ask(chosen) == []
         assert_quiet(tab, pages["plan"])
@@ -53,14 +53,15 @@ def test_the_camera_follows_the_robot_and_shows_the_whole_scene_again(chrome: Br
         tab.settle()
         whole = tab.ask(aim)
         tab.press("r")
-        assert tab.ask("document.querySelector('#views [aria-pressed=true]').textContent") == "follow pr2"
+        pressed = "[...document.querySelectorAll('#views [aria-pressed=true]')].map((each) => each.textContent)"
+        assert "follow pr2" in tab.ask(pressed)
         x, y, _ = tab.ask(aim)
         tab.ask("pycrormPage.seek(60)")
         (u, v, _), robot = tab.ask(aim), position(tab, "pr2")
         assert abs(u - robot[0]) < abs(x - robot[0]) + 0.5
         assert [round(u - x, 2), round(v - y, 2)] == [robot[0], robot[1]]  # it stood at the origin
         tab.press("w")
-        assert tab.ask("document.querySelector('#views [aria-pressed=true]')") is None
+        assert "follow pr2" not in tab.ask(pressed)
         moment = tab.ask(aim)
         assert moment not in (whole, [u, v, 0])  # less than all places of the episode
         tab.ask("pycrormPage.seek(pycrormPage.episode.opens)")
@@ -179,7 +180,7 @@ async def test_of_many_objects_as_many_are_named_as_can_be_read(chrome: Browser,
         assert "turtle" in names
         assert tab.ask("[...document.querySelectorAll('#notes p')].map((each) => each.textContent)") == [
             "bowl 0, bowl 1 and 298 others: drawn as the built-in shape, because its description was not recorded",
-            "turtle: drawn as a point, because its description was not recorded",
+            "turtle: drawn as a body with its heading, because its description was not recorded",
         ]
         assert tab.problems() == []
 

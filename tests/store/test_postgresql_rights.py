@@ -180,6 +180,7 @@ async def test_the_roles_have_no_right_to_change_the_log_but_these(server: Serve
         *(("pycrorm_recorder", *each) for each in appended),
         *(("pycrorm_folder", *each) for each in appended),
         ("pycrorm_folder", "UPDATE", "episode.folded"),
+        ("pycrorm_folder", "UPDATE", "pycrorm_removed_episode.finished_wall_ns"),
         ("pycrorm_folder", "UPDATE", "episode.parked"),
     }
 
