@@ -204,7 +204,7 @@ def test_numbers_of_mongodb_times_and_metadata_of_any_kind_end_no_import(tmp_pat
         rows += neems.action(f"Action_STRANGE{index}", "Stirring", BEGIN_S, value)
     (tmp_path / "neem").mkdir()
     lines = "".join(f"{json.dumps(each)}\n" for each in rows)
-    (tmp_path / "neem/triples.json").write_text(lines + '{"o": ' + "[" * 600 + "]" * 600 + "}")
+    (tmp_path / "neem/triples.json").write_text(lines + '{"o": ' + "[" * 100_000 + "]" * 100_000 + "}")
     (tmp_path / "neem/annotations.json").write_bytes(b"")  # what mongoexport writes of an empty collection
     (tmp_path / "neem/meta.json").write_text(json.dumps({"_id": "\ud800", "keywords": 5}))
     report = imported(tmp_path, "neem", tmp_path / "neem")
