@@ -55,10 +55,9 @@ def erase(
     """Erase episodes from the log, the tables, recall, blobs, kept segments of the spool and the file's free pages.
 
     Their numbers, ids, digests, times and the reason stay, in the journal. What arrives of them later, from a spool, a
-    copy or an import, is discarded. An archived episode is erased from its lake too, one that was restored only from
-    the lake that --lake names. Not rewritten are backups, replicas, and on PostgreSQL the write-ahead log and the free
-    space in pages. Run it again after an interruption, or when it has named what is left (exit code 1). On PostgreSQL
-    it needs the login that owns the log.
+    copy or an import, is discarded. An episode that is or was archived is erased from its lake too. Not rewritten are
+    backups, replicas, and on PostgreSQL the write-ahead log and the free space in pages. Run it again after an
+    interruption, or when it has named what is left (exit code 1). On PostgreSQL it needs the login that owns the log.
     """
     if not episodes and keep is None:
         return asyncio.run(_print_journal(place, form))

@@ -94,7 +94,11 @@ async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason
     there = lake.episode_rows([each.id for each in rows])
     kept = await log.last_digests(rows[0].number, rows[-1].number)
     new: list[tuple[LakeEpisode, Sequence[StoredEvent]]] = []
+    elsewhere = {each.id: each.archived_in for each in await log.restored(each.id for each in rows)}
     for row in rows:
+        if elsewhere.get(row.id, lake.address) != lake.address:
+            summary.stayed[row.id] = f"it was restored from {elsewhere[row.id]}, which has it still: archive it there"
+            continue
         try:
             events = await _events(log, row)
             digest = digest_after(RunningDigest.at_start(row.identity), events)

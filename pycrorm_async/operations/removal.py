@@ -87,13 +87,13 @@ async def erase(
     spool: Path,
     lake: str | None = None,
 ) -> list[ErasedEpisode]:
-    """Erase these episodes, or finish their erasure, also in this lake, and in the one in which one is archived.
+    """Erase these episodes, or finish their erasure, also in this lake, and in that to which one was archived.
 
     Raises `CallerError` for one that runs, `MissingExtra` for a lake without the package.
     """
     lakes: dict[str, list[str]] = {} if lake is None else {lake: [each.id for each in rows]}
     archived = [each for each in rows if isinstance(each, RemovedEpisode) and each.archived_in is not None]
-    for each in archived:
+    for each in [*archived, *await log.restored(each.id for each in rows)]:
         lakes.setdefault(each.archived_in or "", []).append(each.id)
     for address, ids in lakes.items():
         erase_in_lake(address, ids)

@@ -34,6 +34,7 @@ from typing import Final, NamedTuple, Protocol
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
+from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DamageError, InternalError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
@@ -435,7 +436,8 @@ class Appending:
                 self.discarded.pop(each, None)
                 refusals.pop(each, None)
                 restored[each] = removed.number
-                await self._dialect.execute(connection, schema.DELETE_REMOVED, id=removed.id)
+                now_ns = SYSTEM_CLOCK.wall_ns()
+                await self._dialect.execute(connection, schema.UPDATE_RESTORED, restored=removed.id, now_ns=now_ns)
         numbers = restored | (await self._assign_numbers(connection, missing) if missing else {})
         for each, number in numbers.items():
             if number > EPISODE_NUMBER_MAX:

@@ -14,7 +14,7 @@ import os
 import sqlite3
 import stat
 import uuid
-from collections.abc import AsyncIterator, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
@@ -310,6 +310,11 @@ class EventLog:
         """Read which of these episodes were erased or archived."""
         async with self.reading() as connection:
             return await removed_of(self._dialect, connection, episodes)
+
+    async def restored(self, ids: Iterable[str]) -> list[RemovedEpisode]:
+        """Return those of these episodes that came back from a lake, which has them still."""
+        async with self.reading() as connection:
+            return await self._dialect.removed(connection, schema.SELECT_RESTORED, ids=[(each,) for each in ids])
 
     async def all_removed(self) -> list[RemovedEpisode]:
         """Read every erased and archived episode, by number."""

@@ -135,8 +135,10 @@ REMOVED: Final = sql.Table(
     *_required(removed_wall_ns=_Long, reason=sql.Text),
     sql.Column("archived_in", sql.Text),
     sql.Column("finished_wall_ns", _Long),
+    sql.Column("restored_wall_ns", _Long),
 )
-"""The episodes whose events have left the log, erased or archived. Created with the first removal."""
+"""The episodes whose events have left the log, erased or archived, and those that a lake still has. Created with the
+first removal."""
 
 
 # === values ===================================================================================================
@@ -366,22 +368,27 @@ SELECT_LAST_DIGESTS: Final = (
     .where(_of_range)
 )
 
-SELECT_REMOVED: Final = select(REMOVED).order_by(REMOVED.c.number)
+SELECT_REMOVED: Final = select(REMOVED).where(REMOVED.c.restored_wall_ns.is_(None)).order_by(REMOVED.c.number)
 SELECT_REMOVED_BY_ID: Final = SELECT_REMOVED.where(_is_among(REMOVED.c.id, "ids"))
 SELECT_REMOVED_NAMED: Final = SELECT_REMOVED.where(
     sql.or_(REMOVED.c.number == bindparam("number"), REMOVED.c.id.between(bindparam("first"), bindparam("last")))
 )
+SELECT_RESTORED: Final = select(REMOVED).where(REMOVED.c.restored_wall_ns.is_not(None), _is_among(REMOVED.c.id, "ids"))
 SELECT_REMOVED_MAX: Final = select(func.coalesce(func.max(REMOVED.c.number), sql.literal_column("0")))
 _removed = _batch("removed", **{each.name: each.type for each in REMOVED.c})
 UPSERT_REMOVED: Final = _insert_batch(REMOVED, _removed).ext(
-    _OnConflict("number", updated=("removed_wall_ns", "reason", "archived_in", "finished_wall_ns"))
+    _OnConflict("number", updated=("removed_wall_ns", "reason", "archived_in", "finished_wall_ns", "restored_wall_ns"))
 )
 UPDATE_FINISHED: Final = (
     sql.update(REMOVED)
     .where(_is_among(REMOVED.c.number, "numbers"))
     .values(finished_wall_ns=bindparam("now_ns", type_=_Long))
 )
-DELETE_REMOVED: Final = sql.delete(REMOVED).where(REMOVED.c.id == bindparam("id"))
+UPDATE_RESTORED: Final = (
+    sql.update(REMOVED)
+    .where(REMOVED.c.id == bindparam("restored"))
+    .values(restored_wall_ns=bindparam("now_ns", type_=_Long))
+)
 
 INSERT_BLOB: Final = _insert_one(BLOB, list(BLOB.c)).ext(_OnConflict("hash", "part"))
 SELECT_COMPLETE_BLOBS: Final = select(BLOB.c.hash).where(

@@ -97,6 +97,7 @@ class RemovedEpisode(NamedTuple):
         removed_wall_ns, reason: the time and the reason of the removal.
         archived_in: the lake that holds its events; None if it was erased.
         finished_wall_ns: the time at which nothing was left of it elsewhere; None until then.
+        restored_wall_ns: the time at which its events came back from the lake, which has them still; else None.
     """
 
     number: int
@@ -109,6 +110,7 @@ class RemovedEpisode(NamedTuple):
     reason: str
     archived_in: str | None = None
     finished_wall_ns: int | None = None
+    restored_wall_ns: int | None = None
 
     def __str__(self) -> str:
         when = f"{datetime.fromtimestamp(self.removed_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC ({self.reason})"

@@ -156,9 +156,11 @@ async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp
     with pytest.raises(UnknownEpisode):
         await copy_episodes(lake, url, episodes=[ids[1]])
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:  # one that the lake still holds is erased there by name
+    try:  # one that came back, and that the lake still holds, is archived nowhere else, and erased there too
         await copy_episodes(lake, url)
-        await erase(log, await erasable(log, ["1"]), reason="asked", spool=tmp_path / "memory.db.spool", lake=lake)
+        [stayed] = (await archived(url, f"ducklake:{tmp_path}/other")).stayed.values()
+        assert stayed == f"it was restored from {lake}, which has it still: archive it there"
+        await erase(log, await erasable(log, ["1"]), reason="asked", spool=tmp_path / "memory.db.spool")
     finally:
         await log.close()
     assert query_lake(lake, "SELECT count(*) FROM event")[1] == [(0,)]
