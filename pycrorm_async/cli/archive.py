@@ -14,7 +14,7 @@ from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.output import Form, LakeOption, parse_since, print_rows, problem
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
-from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
+from pycrorm_async.operations.archive import archive_episodes
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.lake import shown
 
@@ -35,7 +35,10 @@ def archive(
     if lake is None:
         raise CallerError("name the lake with --to ducklake:FOLDER")
     collect_seldom()
-    summary = asyncio.run(_archive(place, lake, before))
+    reason, before_this = f"archive --before {before}", parse_since(before)
+    with progress_bar("archiving") as report:
+        archiving = archive_episodes(place.url, lake, before=before_this, reason=reason, report_progress=report)
+        summary = asyncio.run(archiving)
     rows = [(each.number, each.id, each.head, each.digest) for each in summary.removed]
     document = {"archived": [each._asdict() for each in summary.removed], "stayed": summary.stayed}
     print_rows(form, document, f"Archived in {shown(lake)}", ("episode", "id", "events", "digest"), rows)
@@ -43,14 +46,3 @@ def archive(
         problem(f"episode {name} stays: {why}")
     place.note_pending_events()
     return 4 if summary.stayed else 0
-
-
-async def _archive(place: Place, lake: str, before: str) -> ArchiveSummary:
-    with progress_bar("archiving") as report_progress:
-        return await archive_episodes(
-            place.url,
-            lake,
-            before=parse_since(before),
-            reason=f"archive --before {before}",
-            report_progress=report_progress,
-        )

@@ -127,26 +127,13 @@ async def _print_journal(place: Place, form: Form) -> int:
 
 def _print(form: Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) -> None:
     columns = ("episode", "id", "events", "ended", "removed", "reason", "archived in")
-    print_rows(
-        form,
-        [each._asdict() for each in rows],
-        title,
-        columns,
-        [
-            (
-                each.number,
-                each.id,
-                each.head,
-                _moment(each.ended_wall_ns),
-                *(
-                    (_moment(each.removed_wall_ns), each.reason, each.archived_in)
-                    if isinstance(each, RemovedEpisode)
-                    else ("", "", "")
-                ),
-            )
-            for each in rows
-        ],
-    )
+    cells: list[tuple[object, ...]] = []
+    for each in rows:
+        removal: tuple[str | None, ...] = ("", "", "")
+        if isinstance(each, RemovedEpisode):
+            removal = _moment(each.removed_wall_ns), each.reason, each.archived_in
+        cells.append((each.number, each.id, each.head, _moment(each.ended_wall_ns), *removal))
+    print_rows(form, [each._asdict() for each in rows], title, columns, cells)
 
 
 def _moment(wall_ns: int | None) -> str:

@@ -24,12 +24,8 @@ def examples(
     as_json: JsonOption = False,
 ) -> None:
     """Copy the example notebooks into a folder. A file that exists there, and differs, is never overwritten."""
-    notebooks = {
-        each.name: each.read_text()
-        for each in sorted(files("pycrorm_async.examples").iterdir(), key=lambda each: each.name)
-        if each.name.endswith(".ipynb")
-    }
-    copies = {folder / name: text for name, text in notebooks.items()}
+    notebooks = [each for each in files("pycrorm_async.examples").iterdir() if each.name.endswith(".ipynb")]
+    copies = {folder / each.name: each.read_text() for each in sorted(notebooks, key=lambda each: each.name)}
     if changed := [str(path) for path, text in copies.items() if path.exists() and path.read_text() != text]:
         raise CallerError(f"{', '.join(changed)} would be overwritten: name another folder")
     folder.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,7 @@ from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailab
 from pycrorm_async.events.codec import Record
 from pycrorm_async.store import dialect, schema, sqlite_engine
 from pycrorm_async.store.dialect import MADE
-from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, Connection, claim
+from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, StoppableConnection, claim
 from pycrorm_async.store.stored import Span, StoredEvent
 
 _COUNT_TABLES: Final = (
@@ -283,12 +283,12 @@ def _events(number: int, heads: str, payloads: bytes | None) -> list[StoredEvent
     return events
 
 
-async def _driver(connection: AsyncConnection) -> Connection:
+async def _driver(connection: AsyncConnection) -> StoppableConnection:
     """Return the driver's connection, to run many statements in one visit to its thread; begin a transaction."""
     if not connection.in_transaction():
         await connection.begin()
     driver = (await connection.get_raw_connection()).driver_connection
-    assert isinstance(driver, Connection)
+    assert isinstance(driver, StoppableConnection)
     return driver
 
 

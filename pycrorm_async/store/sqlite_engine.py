@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
 import aiosqlite
-from sqlalchemy import URL, event
-from sqlalchemy import Connection as SyncConnection
+from sqlalchemy import URL, Connection, event
 from sqlalchemy.engine.interfaces import IsolationLevel
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
@@ -95,7 +94,7 @@ class _Pool(AsyncAdaptedQueuePool):
             super()._do_return_conn(record)
 
 
-class Connection(aiosqlite.Connection):
+class StoppableConnection(aiosqlite.Connection):
     """An aiosqlite connection whose `stop` may be called twice.
 
     When a close is cancelled, SQLAlchemy stops the thread while the close still runs and stops it again. The second
@@ -189,7 +188,7 @@ class SharedCursor:
 
     arraysize = 1
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: StoppableConnection) -> None:
         self.description: Any = None
         self.rowcount = -1
         self.lastrowid: int | None = None
@@ -250,7 +249,7 @@ class SharedCursor:
         return rows
 
 
-async def _connect(uri: str, busy_timeout_s: float) -> Connection:
+async def _connect(uri: str, busy_timeout_s: float) -> StoppableConnection:
     opened: list[sqlite3.Connection] = []
 
     def connector() -> sqlite3.Connection:
@@ -266,7 +265,7 @@ async def _connect(uri: str, busy_timeout_s: float) -> Connection:
         )
         return opened[0]
 
-    connection = Connection(connector, _ROWS_AT_ONCE)
+    connection = StoppableConnection(connector, _ROWS_AT_ONCE)
     connection.patience_s = busy_timeout_s
     thread = connection._thread  # noqa: SLF001 - as SQLAlchemy does; aiosqlite has no public attribute
     thread.daemon = True
@@ -321,11 +320,11 @@ def _begin_and(work: Callable[[sqlite3.Connection], _T], connection: sqlite3.Con
     return work(connection)
 
 
-def _begin(connection: SyncConnection) -> None:
+def _begin(connection: Connection) -> None:
     statement = connection.get_execution_options()[BEGIN]
     if statement == READ:
         driver = connection.connection.driver_connection
-        assert isinstance(driver, Connection)
+        assert isinstance(driver, StoppableConnection)
         driver.begin_to_read()
     elif statement is not None:
         connection.connection.run_async(lambda driver: driver.cursor().execute(statement))

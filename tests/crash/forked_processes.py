@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import signal
 import sys
 import threading
 import time
@@ -14,14 +15,31 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 
+from sqlalchemy import Engine, event
+
 from tests.commands import FORKED, fork
 
-__all__ = ["ForkedProcess"]
+__all__ = ["ForkedProcess", "die_at_statement"]
 
 Start = Callable[[ForkServerProcess], None]
 
 _HANGS_S = 900.0
 """A process that takes longer hangs. On a busy machine one may need minutes to start."""
+
+
+def die_at_statement(last: int) -> Callable[[], None]:
+    """Kill this process before the statement or commit number `last`; 0: never. Returns what prints their count."""
+    count = 0
+
+    def die_at_last(*_: object) -> None:
+        nonlocal count
+        count += 1
+        if count == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    event.listen(Engine, "before_cursor_execute", die_at_last)
+    event.listen(Engine, "commit", die_at_last)
+    return lambda: print(count, flush=True)
 
 
 class ForkedProcess:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import asyncio
 import os
 import random
-import signal
 import threading
 import time
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from sqlalchemy import event, func, select
-from sqlalchemy.engine import Engine
+from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.operations import rebuild as rebuilding
@@ -21,7 +19,7 @@ from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpWithContextView, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
 from pycrorm_async.settings import Settings
-from tests.crash.forked_processes import ForkedProcess
+from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable
 from tests.projections.event_script import append_and_fold
@@ -163,19 +161,10 @@ def rebuild_until(url: str, last: int, workers: int, batch_events: int) -> None:
     """Rebuild, and die before statement number `last`; with 0 rebuild to the end and print the count of statements."""
     rebuilding._SHARE_EVENTS_MIN = 1
     steps._BATCH_EVENTS = batch_events
-    count = 0
-
-    def die_at_last(*_: object) -> None:
-        nonlocal count
-        count += 1
-        if count == last:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    event.listen(Engine, "before_cursor_execute", die_at_last)
-    event.listen(Engine, "commit", die_at_last)
+    print_count = die_at_statement(last)
     print("began", flush=True)
     asyncio.run(rebuild_memory(url, workers=workers))
-    print(count, flush=True)
+    print_count()
 
 
 def _input_closed() -> threading.Event:

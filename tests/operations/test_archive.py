@@ -11,8 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from sqlalchemy import event
-from sqlalchemy.engine import Engine
 
 from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, UnknownEpisode
@@ -23,7 +21,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.lake import Lake, erase_in_lake, query_lake
 from pycrorm_async.store.log import EventLog
 from tests.commands import pycrorm
-from tests.crash.forked_processes import ForkedProcess
+from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import ask, put_memory
 from tests.operations.memories import everything, notes
 from tests.operations.test_removal import SECRET, assert_clean, erased, places_with, recorded
@@ -99,18 +97,9 @@ async def test_several_memories_archive_into_one_lake_and_what_arrives_of_an_arc
 
 def archive_until(url: str, lake: str, last: int) -> None:
     """Archive, and die before statement number `last` of the memory; with 0 to the end, and print their count."""
-    count = 0
-
-    def die_at_last(*_: object) -> None:
-        nonlocal count
-        count += 1
-        if count == last:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    event.listen(Engine, "before_cursor_execute", die_at_last)
-    event.listen(Engine, "commit", die_at_last)
+    print_count = die_at_statement(last)
     asyncio.run(archived(url, lake))
-    print(count, flush=True)
+    print_count()
 
 
 @pytest.mark.soak_on("postgresql")

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import signal
 from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from sqlalchemy import event
-from sqlalchemy.engine import Engine
 
 from pycrorm_async import Blob, Memory, Reading
 from pycrorm_async.errors import CallerError, UnknownEpisode
@@ -27,7 +23,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import pycrorm
-from tests.crash.forked_processes import ForkedProcess
+from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import Server, ask, ask_to_change, change_each
 from tests.memory.note_actions import NoteActionPerformable
 from tests.table_comparison import Tables, differences, logs_of, tables_of
@@ -207,18 +203,9 @@ async def test_a_memory_that_is_open_goes_on_and_what_its_recorder_still_holds_i
 
 def erase_until(url: str, name: str, last: int) -> None:
     """Erase an episode, and die before statement number `last`; with 0 erase to the end and print their count."""
-    count = 0
-
-    def die_at_last(*_: object) -> None:
-        nonlocal count
-        count += 1
-        if count == last:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    event.listen(Engine, "before_cursor_execute", die_at_last)
-    event.listen(Engine, "commit", die_at_last)
+    print_count = die_at_statement(last)
     asyncio.run(erased(url, name))
-    print(count, flush=True)
+    print_count()
 
 
 @pytest.mark.soak_on("postgresql")

@@ -1,4 +1,4 @@
-"""Processes that fold one memory on PostgreSQL share its episodes: each event is folded once, and by somebody."""
+"""Processes that fold one memory on PostgreSQL share its episodes: no event is folded twice or forgotten."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.sqlite_engine import USE_WAL, Connection, _connect, make_engine
+from pycrorm_async.store.sqlite_engine import USE_WAL, StoppableConnection, _connect, make_engine
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from tests.databases import Server, ask
 from tests.projections.rebuild_cases import TYPES, picking
@@ -34,9 +34,9 @@ from tests.store.factories import cancel_at_await
 # Connections are closed with their engine, also those that a task returns afterwards.
 
 
-async def driver_of(connection: AsyncConnection) -> Connection:
+async def driver_of(connection: AsyncConnection) -> StoppableConnection:
     driver = (await connection.get_raw_connection()).driver_connection
-    assert isinstance(driver, Connection)
+    assert isinstance(driver, StoppableConnection)
     return driver
 
 

@@ -16,7 +16,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.append import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
-from pycrorm_async.store.sqlite_engine import Connection
+from pycrorm_async.store.sqlite_engine import StoppableConnection
 from pycrorm_async.store.stored import Incarnation, Span, StoredEvent
 from tests.databases import Server, ask, ask_to_change, change_each
 from tests.store.factories import episode, record, run_of
@@ -156,7 +156,7 @@ async def test_events_are_read_even_if_together_they_exceed_the_limit_of_one_val
     assert [(each.sequence, each.payload) for each in whole] == [(each.sequence, each.payload) for each in records[2:9]]
     async with file_log.reading() as connection:
         driver = (await connection.get_raw_connection()).driver_connection
-        assert isinstance(driver, Connection)
+        assert isinstance(driver, StoppableConnection)
         await driver.visit(lambda raw: raw.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 3_000))
         assert await dialect_of(file_log.engine).spans(connection, [Span(1, 2, 9)]) == whole
 
@@ -202,14 +202,14 @@ async def test_rows_fetched_one_by_one_take_few_visits_to_the_thread(
 ) -> None:
     await file_log.append(run_of(episode(1), 1, 200))
     visited: list[object] = []
-    visit = Connection.visit
+    visit = StoppableConnection.visit
 
-    async def counted_visit(connection: Connection, work: Callable[[sqlite3.Connection], Any]) -> Any:
+    async def counted_visit(connection: StoppableConnection, work: Callable[[sqlite3.Connection], Any]) -> Any:
         visited.append(work)
         return await visit(connection, work)
 
     async with file_log.reading() as connection:
-        monkeypatch.setattr(Connection, "visit", counted_visit)
+        monkeypatch.setattr(StoppableConnection, "visit", counted_visit)
         streamed = await connection.stream(text(f"SELECT sequence FROM event ORDER BY sequence LIMIT {rows}"))
         fetched = []
         while (row := await streamed.fetchone()) is not None:
