@@ -46,7 +46,7 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import NotEnoughExperience
 from pycrorm_async.learning import MoveAndPickUp, Policy, RecalledPickUp, Scene, Tally, learn
 from pycrorm_async.learning.experiment import KITCHEN
-from pycrorm_async.learning.rollouts import Stage
+from pycrorm_async.learning.scenes import Stage
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.plan.locations import surface_poses

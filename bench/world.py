@@ -18,7 +18,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, batch_rollout
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts import batch_rollout
+from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.world import PR2, Arms, BulletWorld, Object, ObjectType, Pose, copied
 from pycrorm_async.world.engines import ENGINES, VARIABLE, engine_class
 from pycrorm_async.world.pose import EngineMissing

@@ -34,7 +34,8 @@ from pycrorm_async.learning.experiment import (
 )
 from pycrorm_async.learning.policy import default_policy, draw_policies, name_of, save_policy
 from pycrorm_async.learning.pool import MemoryLocation
-from pycrorm_async.learning.rollouts import Scene, Tally
+from pycrorm_async.learning.rollouts import Tally
+from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.engines import engine_class

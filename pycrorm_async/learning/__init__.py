@@ -4,6 +4,7 @@
 >>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()
 """
 
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp, RecalledPickUp, RecalledPickUpPerformable
 from pycrorm_async.learning.policy import (
     Evidence,
     PickUpChoice,
@@ -17,16 +18,8 @@ from pycrorm_async.learning.policy import (
     save_policy,
 )
 from pycrorm_async.learning.recorded_policy import read_policy, record_policy
-from pycrorm_async.learning.rollouts import (
-    MoveAndPickUp,
-    RecalledPickUp,
-    RecalledPickUpPerformable,
-    Scene,
-    Stage,
-    Tally,
-    batch_rollout,
-    rollouts_question,
-)
+from pycrorm_async.learning.rollouts import Tally, batch_rollout, rollouts_question
+from pycrorm_async.learning.scenes import Scene, Stage
 from pycrorm_async.learning.tree import learn
 
 __all__ = [

@@ -17,10 +17,12 @@ from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy, name_of
 from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask, Workers
 from pycrorm_async.learning.recorded_policy import record_policy
-from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, Tally, tally_of
+from pycrorm_async.learning.rollouts import Tally, tally_of
+from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.learning.tree import check_leaf, learn
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.recovery import recover

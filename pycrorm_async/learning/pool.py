@@ -45,8 +45,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, PycrormError, SpoolTaken
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import Policy, name_of
-from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, Tally, batch_rollout
+from pycrorm_async.learning.rollouts import Tally, batch_rollout
+from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.workers import ChildProcess

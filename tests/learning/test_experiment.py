@@ -27,8 +27,9 @@ from pycrorm_async.learning.experiment import (
     run,
     study,
 )
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.pool import MemoryLocation, RolloutTask, WorkerLost, Workers
-from pycrorm_async.learning.rollouts import MoveAndPickUp, Tally, batch_rollout
+from pycrorm_async.learning.rollouts import Tally, batch_rollout
 from pycrorm_async.learning.tree import learn
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import MoveAndPickUpAction

@@ -27,8 +27,9 @@ from pycrorm_async.learning import (
     default_policy,
     name_of,
 )
+from pycrorm_async.learning.move_and_pick_up import free_and_visible, rectangles
 from pycrorm_async.learning.policy import AROUND_OBJECT, GRASPS, Evidence, Leaf, Linear, PickUpChoice
-from pycrorm_async.learning.rollouts import Stage, free_and_visible, rectangles
+from pycrorm_async.learning.scenes import Stage
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import MoveTCPMotion, Retry, Sequential
 from pycrorm_async.plan.failures import (

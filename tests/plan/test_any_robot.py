@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.learning.rollouts import MoveAndPickUp
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.plan import (
     AccessingLocation,
     ActionAbstract,

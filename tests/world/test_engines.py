@@ -21,7 +21,9 @@ import pytest
 from pycrorm_async.cli.demo import breakfast, kitchen_world
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.experiment import KITCHEN
-from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, Tally, batch_rollout
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts import Tally, batch_rollout
+from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.plan import PlanFailure
 from pycrorm_async.plan.locations import surface_poses
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, WorldMode, copied

@@ -1,0 +1,448 @@
+"""Describe pick-ups whose arm, grasp and base position are sampled from a policy or recalled (thesis 5.2).
+
+>>> await Retry(MoveAndPickUp(milk, policy=learned), max_tries=20).perform()
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Select, select
+
+from pycrorm_async.errors import CallerError, ImpossibleCondition
+from pycrorm_async.learning.policy import (
+    ARMS,
+    GRASPS,
+    Evidence,
+    PickUpChoice,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+    name_of,
+)
+from pycrorm_async.learning.recorded_policy import keep_policy
+from pycrorm_async.orm import PickUpWithContextView
+from pycrorm_async.plan import objects
+from pycrorm_async.plan.actions import MoveAndPickUpPerformable
+from pycrorm_async.plan.failures import ObjectUnreachable
+from pycrorm_async.plan.geometry import lifting_arms
+from pycrorm_async.plan.language import ActionDescription
+from pycrorm_async.plan.locations import BaseClearance, base_clearance, base_height_m, face
+from pycrorm_async.plan.task import Experience, PastSuccess, experience
+from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.bullet import Object
+from pycrorm_async.world.pose import Arms, Grasp, Pose, rotated
+from pycrorm_async.world.queries import Costmap, OccupancyCostmap, VisibilityCostmap
+
+# === feasible places ==========================================================================================
+#
+# Compute the places around an object that are free for the robot's base and from which its camera sees the object.
+#
+# The places are rectangles in the object's own frame.
+
+CLEARANCE_M = 0.3
+"""Minimum distance between the middle of the robot's base and any obstacle, the thesis' value."""
+REACH_M = 2.0
+"""Half the side of the square of places around the object: the same as the range of the default policy."""
+_RESOLUTION_M = 0.05
+_CELLS = round(2 * REACH_M / _RESOLUTION_M)
+_VISIBLE_SHARE_MIN = 0.5
+"""The least share of the object that must be visible from a place."""
+
+
+def free_and_visible(robot: objects.CurrentRobot, target: Object) -> Region:
+    """Return the places where the robot's base is clear of obstacles and its camera sees the object. Moves nothing.
+
+    Where collisions count, the base is clear of the places outside with any heading; `MoveAndPickUp` checks the heading
+    of each of its samples.
+    """
+    world, ignored = target.world, robot.with_load()
+    ground = Pose((target.pose.position.x, target.pose.position.y, 0.0))
+    low, high = robot.camera_heights_m()
+    # The maps are not turned with the object, so the square in its frame needs up to √2 times the side: 1.5 is enough.
+    size = {"size_cells": 2 * round(0.75 * _CELLS), "resolution_m": _RESOLUTION_M}
+    clearance = base_clearance([robot])
+    free = (
+        OccupancyCostmap(world, ground, distance_to_obstacle_m=CLEARANCE_M, ignore=ignored, **size)  # type: ignore[arg-type]
+        if clearance is None
+        else clearance.costmap(ground, **size)  # type: ignore[arg-type]
+    )
+    visible = VisibilityCostmap(
+        world,
+        target,
+        min_height_m=low,
+        max_height_m=high,
+        origin=ground,
+        ignore=ignored,
+        **size,  # type: ignore[arg-type]
+    )
+    middles = (np.arange(_CELLS) + 0.5) * _RESOLUTION_M - REACH_M
+    places = _values(free, target.pose.yaw, middles) > 0
+    places &= _values(visible, target.pose.yaw, middles) >= _VISIBLE_SHARE_MIN
+    return Region(tuple(rectangles(places)))
+
+
+def _values(costmap: Costmap, yaw: float, middles: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Sample the map at the cells of a grid that is turned by `yaw` about the map's origin."""
+    x, y = np.meshgrid(middles, middles, indexing="ij")
+    turned = (np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y)
+    row, column = (np.floor(each / costmap.resolution_m + costmap.size_cells / 2).astype(int) for each in turned)
+    return np.asarray(costmap.map[row, column])
+
+
+def rectangles(cells: NDArray[np.bool_]) -> Iterator[Rectangle]:
+    """Cover the true cells with disjoint rectangles; equal runs along y in consecutive rows become one rectangle."""
+    open_runs: dict[tuple[int, int], int] = {}
+    for row in range(len(cells) + 1):
+        runs = set(_runs(cells[row])) if row < len(cells) else set()
+        for run in [each for each in open_runs if each not in runs]:
+            edges = (open_runs.pop(run), row, *run)
+            yield Rectangle(*(each * _RESOLUTION_M - REACH_M for each in edges))
+        for run in runs:
+            open_runs.setdefault(run, row)
+
+
+def _runs(cells: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield the start and the end (exclusive) of each run of true cells."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], cells, [False]])))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+# === move and pick up =========================================================================================
+#
+# Describe move-and-pick-up actions whose arm, grasp and base position are sampled from a policy (thesis 5.2).
+
+HEIGHT_TOLERANCE_M = 0.05
+"""Experience with objects up to this much higher or lower, measured from the torso, applies to the present object."""
+_DRAWS_MAX = 10
+"""Bounds the draws as a multiple of the samples, because in a scene without free places all samples collide."""
+_UPRIGHT_MIN = 0.1
+"""Minimum vertical component of the object's own z axis (a cosine); below it the object lies on its side and its x-y
+plane no longer maps to the floor."""
+
+
+class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
+    """A description whose alternatives for moving to an object and picking it up are samples of a policy.
+
+    Iterating draws samples that fit the scene and yields the likeliest first:
+
+    >>> await Retry(MoveAndPickUp(milk, policy=learned), max_tries=20).perform()
+
+    Args:
+        target: the object, or a description of it.
+        arms, grasps: the allowed ones; None allows all.
+        policy: the distribution of base positions, arms and grasps; None means the thesis' default policy.
+        samples: number of alternatives.
+        rng: random generator; None means a new one with an unpredictable seed.
+
+    Each alternative names the policy as passed, before arms and grasps limit it (`policy_name`). The first alternative
+    in an episode records the policy's content, once for each opened memory (`read_policy`).
+
+    Raises `ImpossibleCondition` if the policy gives these arms or grasps no probability, `CallerError` if
+    samples < 1.
+    """
+
+    def __init__(
+        self,
+        target: objects.ObjectLike | objects.ObjectDesignatorDescription,
+        arms: Iterable[Arms] | None = None,
+        grasps: Iterable[Grasp] | None = None,
+        policy: Policy | None = None,
+        *,
+        samples: int = 20,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        super().__init__(MoveAndPickUpPerformable)
+        if samples < 1:
+            raise CallerError(f"samples must be >= 1, got {samples}")
+        self.target = (
+            target.resolve()
+            if isinstance(target, objects.ObjectDesignatorDescription)
+            else objects.designator_of(target)
+        )
+        self.allowed = evidence = Evidence(
+            arms=frozenset(arms) if arms is not None else None,
+            grasps=frozenset(grasps) if grasps is not None else None,
+        )
+        self._passed_policy = policy = default_policy() if policy is None else policy
+        self.policy_name = name_of(policy)
+        self.policy: Policy = policy if evidence == Evidence() else policy.condition(evidence)
+        self.samples = samples
+        self._rng = np.random.default_rng() if rng is None else rng
+
+    def __repr__(self) -> str:
+        return f"MoveAndPickUp({self.target.name!r}, policy={self.policy_name})"
+
+    @staticmethod
+    def query_for_database() -> Select[Arms, Grasp, float, float, float | None]:
+        """Select the successful pick-ups of all episodes, the input of `learn`.
+
+        A data frame of it has the columns arm, grasp, object_x, object_y (the robot's position in the object's own
+        frame, m) and height (of the object over the lifted torso, m). Add a `where` to cut it, by columns of
+        `PickUpWithContextView` such as `robot`, `description` and `scene` (of the episode) or `obj_type`.
+        """
+        view = PickUpWithContextView
+        return select(
+            view.arm,
+            view.grasp,
+            view.robot_in_object_x.label("object_x"),
+            view.robot_in_object_y.label("object_y"),
+            view.height_over_torso.label("height"),
+        ).where(view.status == TaskStatus.SUCCEEDED)
+
+    # --- policies for the current scene -----------------------------------------------------------------------
+
+    @property
+    def height(self) -> float:
+        """Height of the object over the lifted torso at this moment, m. Raises `NoWorld`, `NoRobotHere`."""
+        robot = objects.require_robot()
+        torso = robot.body.joint_position(robot.torso_joint())
+        return self.target.pose.position.z - robot.body.pose.position.z - torso
+
+    def policy_here(self) -> Policy:
+        """Condition the policy on the object's height, and its mass if an allowed arm does not lift it.
+
+        Raises `ObjectUnreachable` if that has probability 0.
+        """
+        return self._condition(Evidence(self._strong_enough(), height=_around(self.height)), "at this height")
+
+    def grounded(self) -> Policy:
+        """Condition the policy on height and mass of the object, and on the free places that see it.
+
+        Raises `ObjectUnreachable` if that has probability 0.
+        """
+        region = free_and_visible(objects.require_robot(), objects.in_world(self.target))
+        return self._condition(
+            Evidence(self._strong_enough(), region=region, height=_around(self.height)), "in this scene"
+        )
+
+    def _strong_enough(self) -> frozenset[Arms] | None:
+        """Return the allowed arms that lift the object; None if that does not rule one out."""
+        allowed = ARMS if self.allowed.arms is None else tuple(self.allowed.arms)
+        lifting = lifting_arms(objects.require_robot(), allowed, self.target)
+        return frozenset(lifting) if len(lifting) < len(allowed) else None
+
+    def _condition(self, evidence: Evidence, where: str) -> Policy:
+        try:
+            return self.policy.condition(evidence)
+        except ImpossibleCondition as impossible:
+            message = f"the policy has no way to pick up {self.target.name} {where}: {impossible}"
+            raise ObjectUnreachable(message, self.target.name) from impossible
+
+    # --- alternatives -----------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
+        """Yield samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none fits."""
+        yield from map(self.chosen, self.choices())
+
+    def choices(self) -> Iterator[PickUpChoice]:
+        """Yield the choices of `__iter__`."""
+        self.keep_policy()
+        yield from self._likeliest_first(self.grounded())
+
+    def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
+        """Yield samples from around the mode of the grounded policy only, as the thesis' `iter_with_mode` does.
+
+        Raises `ObjectUnreachable`.
+        """
+        self.keep_policy()
+        yield from map(self.chosen, self._likeliest_first(self.grounded().mode()))
+
+    def plain(self) -> Iterator[MoveAndPickUpPerformable]:
+        """Yield samples in the order they are drawn, without regard to obstacles and visibility."""
+        self.keep_policy()
+        for choice in self.policy_here().sample(self._rng, self.samples):
+            yield self.chosen(choice)
+
+    def keep_policy(self) -> None:
+        """Record the policy's content in the open episode, once for each opened memory."""
+        keep_policy(self.policy_name, self._passed_policy)
+
+    def _likeliest_first(self, policy: Policy) -> Iterator[PickUpChoice]:
+        choices = self._clear_choices(policy)
+        for number in np.argsort(-policy.likelihood(choices), kind="stable"):
+            yield choices[number]
+
+    def _clear_choices(self, policy: Policy) -> Sequence[PickUpChoice]:
+        """Draw samples; where collisions count, only those where the base is clear before and after it turns.
+
+        Raises `ObjectUnreachable` if collisions count and none of `_DRAWS_MAX` times as many samples is clear.
+        """
+        clearance = base_clearance()
+        if clearance is None:
+            return policy.sample(self._rng, self.samples)
+        clear: list[PickUpChoice] = []
+        for _ in range(_DRAWS_MAX):
+            clear += [each for each in policy.sample(self._rng, self.samples) if self.is_clear(each, clearance)]
+            if len(clear) >= self.samples:
+                break
+        if not clear:
+            message = f"the base would be in collision at every place to pick up {self.target.name}"
+            raise ObjectUnreachable(message, self.target.name)
+        return clear[: self.samples]
+
+    def is_clear(self, choice: PickUpChoice, clearance: BaseClearance) -> bool:
+        """Return whether the base is clear of obstacles at its place, before and after it turns to the object."""
+        place = self.chosen(choice).standing_position
+        facing = face(place, self.target.pose, height_m=place.position.z)
+        return clearance.refusal(place) is None and clearance.refusal(facing) is None
+
+    def chosen(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
+        """Return the action for this choice and the object's current pose.
+
+        The base's position is above the point of the floor that has these x and y in the object's own frame. Raises
+        `ObjectUnreachable` for an object that lies on its side, whose x-y plane does not map to the floor.
+        """
+        pose = self.target.pose
+        up = rotated(pose.orientation, (0.0, 0.0, 1.0))
+        if abs(up.z) < _UPRIGHT_MIN:
+            message = f"{self.target.name} lies on its side: its frame gives no position on the floor"
+            raise ObjectUnreachable(message, self.target.name)
+        x, y, z = (pose @ Pose((choice.relative_x, choice.relative_y, 0.0))).position
+        standing_position = Pose((x - z * up.x / up.z, y - z * up.y / up.z, base_height_m()))
+        return MoveAndPickUpPerformable(
+            standing_position, self.target, choice.arm, choice.grasp, policy=self.policy_name
+        )
+
+
+def _around(height: float) -> tuple[float, float]:
+    return height - HEIGHT_TOLERANCE_M, height + HEIGHT_TOLERANCE_M
+
+
+# === recalled pick up =========================================================================================
+#
+# Describe a pick-up whose alternatives are the ways that succeeded before, at about this height.
+
+_EVIDENCE_MIN = 0.5
+"""The least evidence for an alternative: that of one success at a height 12 cm away."""
+
+
+@dataclass
+class RecalledPickUpPerformable(MoveAndPickUpPerformable):
+    """Drive to a place, face the object from there, and pick it up; the node records why this way was chosen.
+
+    Attributes:
+        chosen_by: `recall`, `default policy`, or the name of a learned policy.
+        expected_success: the share of successes that recall expects, 0 to 1; None if a policy chose it.
+    """
+
+    chosen_by: str = "recall"
+    expected_success: float | None = None
+
+
+class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
+    """A description whose alternatives for moving to an object and picking it up are those of earlier tries.
+
+    Each alternative is the way with the highest expected success at the object's height over the lifted torso. The
+    tries of this process count as soon as they have ended, so that a failure also makes similar ways less likely.
+    Leaves out ways that are expected to succeed less often than an average try, and ways without a similar try; after
+    the last one the samples of the policy follow, as in `MoveAndPickUp`, and then those of the default policy.
+
+    >>> await Retry(RecalledPickUp(milk, policy=learned), max_tries=20).perform()
+
+    Args:
+        target: the object, or a description of it.
+        arms, grasps: the allowed ones; None allows all.
+        policy: the policy that follows; None means the thesis' default policy alone.
+        experience: the source of earlier tries; None means the open memory, or none if no memory is open.
+        samples: number of each policy's samples.
+        rng: random generator of the policies; None means a new one with an unpredictable seed.
+
+    Raises what `MoveAndPickUp` raises. The robot drives only to free places from which the object is visible.
+    """
+
+    def __init__(
+        self,
+        target: objects.ObjectLike | objects.ObjectDesignatorDescription,
+        arms: Iterable[Arms] | None = None,
+        grasps: Iterable[Grasp] | None = None,
+        policy: Policy | None = None,
+        *,
+        experience: Experience | None = None,
+        samples: int = 20,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        super().__init__(RecalledPickUpPerformable)
+        self._arms = ARMS if arms is None else tuple(arms)
+        self._grasps = GRASPS if grasps is None else tuple(grasps)
+        rng = np.random.default_rng() if rng is None else rng
+        self._default = MoveAndPickUp(target, self._arms, self._grasps, samples=samples, rng=rng)
+        self._otherwise = [(self._default, "default policy")]
+        if policy is not None:
+            learned = MoveAndPickUp(self._default.target, self._arms, self._grasps, policy, samples=samples, rng=rng)
+            self._otherwise.insert(0, (learned, name_of(policy)))
+        self._experience = experience
+        self.target = self._default.target
+
+    def __repr__(self) -> str:
+        return f"RecalledPickUp({self.target.name!r}, otherwise={self._otherwise[0][1]})"
+
+    async def resolve(self) -> RecalledPickUpPerformable:  # type: ignore[override]  # a memory is asked
+        """Return the first alternative. Raises `ObjectUnreachable` if there is none."""
+        async for each in self:
+            return each
+        raise ObjectUnreachable(f"there is no way to pick up {self.target.name} here", self.target.name)
+
+    def __iter__(self) -> Iterator[RecalledPickUpPerformable]:
+        """Raise `CallerError`, because the memory is queried between two alternatives."""
+        raise CallerError("a recalled pick-up asks the memory: iterate with `async for`, or `await …resolve()`")
+
+    async def __aiter__(self) -> AsyncIterator[RecalledPickUpPerformable]:
+        """Yield the way with the highest expected success that was not yielded yet, then the policy's samples."""
+        source = self._experience if self._experience is not None else experience.get()
+        if source is not None:
+            region, clearance = (
+                free_and_visible(objects.require_robot(), objects.in_world(self.target)),
+                base_clearance(),
+            )
+            tried: set[PickUpChoice] = set()
+            while (best := await self._best(source, region, clearance, tried)) is not None:
+                choice, way = best
+                tried.add(choice)
+                yield self._performable_of(choice, "recall", expected=way.score)
+        for description, chosen_by in self._otherwise:
+            try:
+                choices = [*description.choices()]
+            except ObjectUnreachable:
+                if description is self._default:
+                    raise
+                continue  # a learned policy may know no way at this height
+            for each in choices:
+                yield self._performable_of(each, chosen_by, policy=description.policy_name)
+
+    async def _best(
+        self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]
+    ) -> tuple[PickUpChoice, PastSuccess] | None:
+        """Return the best way that is left and possible here."""
+        robot = objects.require_robot()
+        torso = robot.body.joint_position(robot.torso_joint()) if robot.description.torso_joint is not None else None
+        over_base = self.target.pose.position.z - robot.body.pose.position.z
+        arms = lifting_arms(robot, self._arms, self.target)
+        arm = arms[0] if len(arms) == 1 else None
+        ways = await source.successes(self.target.object_type, arm=arm, height=over_base, torso=torso)
+        places = np.array([each.stand.position[:2] for each in ways]).reshape(-1, 2)
+        for way, is_free in zip(ways, region.contains(*places.T), strict=True):
+            choice = PickUpChoice(way.arm, way.grasp, *way.stand.position[:2])
+            if (
+                is_free
+                and choice not in tried
+                and way.arm in arms
+                and way.grasp in self._grasps
+                and way.score >= way.prior
+                and way.evidence >= _EVIDENCE_MIN
+                and (clearance is None or self._default.is_clear(choice, clearance))
+            ):
+                return choice, way
+        return None
+
+    def _performable_of(
+        self, choice: PickUpChoice, chosen_by: str, *, expected: float | None = None, policy: str | None = None
+    ) -> RecalledPickUpPerformable:
+        move = self._default.chosen(choice)
+        return RecalledPickUpPerformable(
+            move.standing_position, move.object_designator, move.arm, move.grasp, chosen_by, expected, policy=policy
+        )
