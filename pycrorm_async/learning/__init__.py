@@ -19,7 +19,7 @@ from pycrorm_async.learning.policy import (
 )
 from pycrorm_async.learning.recorded_policy import read_policy, record_policy
 from pycrorm_async.learning.rollouts import Tally, batch_rollout, rollouts_question
-from pycrorm_async.learning.scenes import Scene, Stage
+from pycrorm_async.learning.scenes import Disturbance, Scene, Stage
 from pycrorm_async.learning.tree import learn
 
 __all__ = [
@@ -39,6 +39,7 @@ __all__ = [
     "read_policy",
     "name_of",
     "draw_policies",
+    "Disturbance",
     "Scene",
     "Stage",
     "batch_rollout",

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -173,6 +174,12 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         self.policy: Policy = policy if evidence == Evidence() else policy.condition(evidence)
         self.samples = samples
         self._rng = np.random.default_rng() if rng is None else rng
+
+    def of(self, target: objects.ObjectLike) -> MoveAndPickUp:
+        """Return the same description for another object."""
+        other = copy(self)
+        other.target = objects.designator_of(target)
+        return other
 
     def __repr__(self) -> str:
         return f"MoveAndPickUp({self.target.name!r}, policy={self.policy_name})"

@@ -316,6 +316,7 @@ async def _run(pipe: Connection, job: RolloutTask, first: int, count: int, memor
             first=first,
             scene=str(job.scene),
             reset=stage.reset,
+            prepare=stage.prepare if job.scene.varies else None,
             each_in=memory if job.episode_each else None,
             stop=pipe.poll,  # during a run the parent sends nothing but `stop`
             report_progress=report,

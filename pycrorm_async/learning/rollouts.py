@@ -189,6 +189,7 @@ async def batch_rollout(
     first: int = 0,
     scene: str = "",
     reset: Callable[[], None] | None = None,
+    prepare: Callable[[int, int], objects.ObjectLike] | None = None,
     each_in: Memory | None = None,
     stop: Callable[[], bool] = lambda: False,
     report_progress: Callable[[Tally], None] | None = None,
@@ -201,6 +202,8 @@ async def batch_rollout(
         count, first: the indexes of the rollouts: `first`, `first + 1`, … `first + count - 1`.
         scene: the scene in words; recorded, so that queries can separate rollouts in different scenes.
         reset: restores the world after each rollout; None moves everything to its original pose with joints at 0.
+        prepare: draws what varies in the rollout of a seed and an index (`Stage.prepare`), and returns its object; None
+            keeps the action's object where it is.
         each_in: the memory in which each rollout becomes an episode of its own.
         stop: called before each rollout; True ends the batch.
         report_progress: called with the results so far after each rollout; None shows a bar if stderr is a terminal.
@@ -212,7 +215,8 @@ async def batch_rollout(
         raise CallerError(f"count, first and seed of rollouts must be >= 0, got {count}, {first} and {seed}")
     tally = Tally()
     with _bar(count) if report_progress is None else nullcontext(report_progress) as report:
-        run = _Run(action, action.policy_here(), reset or objects.require_world().reset, stop, tally, report)
+        reset = reset or objects.require_world().reset
+        run = _Run(action, action.policy_here() if prepare is None else None, reset, prepare, stop, tally, report)
         slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
         for begin, length in slices:
             if stop():
@@ -243,8 +247,10 @@ class _Run:
     """The parts of a batch that are not recorded."""
 
     action: MoveAndPickUp
-    policy: Policy
+    policy: Policy | None
+    """The policy in this scene; None if the scene varies."""
     reset: Callable[[], None]
+    prepare: Callable[[int, int], objects.ObjectLike] | None
     stop: Callable[[], bool]
     tally: Tally
     report: Callable[[Tally], None]
@@ -271,9 +277,11 @@ class BatchRolloutActionPerformable(ActionAbstract):
         assert run is not None, "only batch_rollout creates and performs a batch"
         run.action.keep_policy()
         for index in self._indexes(run):
-            choice = run.policy.sample(randomness(self.seed, index))[0]
+            action = run.action if run.prepare is None else run.action.of(run.prepare(self.seed, index))
             try:
-                await run.action.chosen(choice).perform()
+                policy = action.policy_here() if run.policy is None else run.policy
+                choice = policy.sample(randomness(self.seed, index))[0]
+                await action.chosen(choice).perform()
             except PlanFailure as failure:
                 run.tally.failures[type(failure).__name__] += 1
             else:
