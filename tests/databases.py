@@ -76,6 +76,12 @@ class Server:
         return folder
 
     @property
+    def system_user(self) -> str | None:
+        """The user who runs the server, because it refuses to run as root; None: this one."""
+        user: str | None = self._server.system_user
+        return user
+
+    @property
     def postmaster(self) -> Any:
         """The server's first process, as psutil knows it."""
         return self._server.get_postmaster_info().process

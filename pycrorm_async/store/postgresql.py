@@ -50,8 +50,8 @@ from pycrorm_async.bulk_records import make
 from pycrorm_async.events import ids
 from pycrorm_async.store import dialect, postgresql_errors, schema
 from pycrorm_async.store.placement import PLAIN, SHARD_SCHEMA, Placement, Shard
+from pycrorm_async.store.postgresql_engine import LOCK_TIMEOUT, PATH, STRANGER, WARNING
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA as LOG
-from pycrorm_async.store.postgresql_engine import PATH, STRANGER, WARNING
 from pycrorm_async.store.postgresql_engine import TABLES_SCHEMA as TABLES
 from pycrorm_async.store.postgresql_engine import VIEWS_SCHEMA as VIEWS
 from pycrorm_async.store.stored import Span, StoredEvent
@@ -80,7 +80,7 @@ AND database = (SELECT oid FROM pg_catalog.pg_database WHERE datname = pg_catalo
 # Less than deadlock_timeout, so that the session that changes tables fails, never a reader.
 WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
 WAIT_FOR_NOBODY = "SET LOCAL lock_timeout = '20ms'"
-WAIT_AS_EVER = "SET LOCAL lock_timeout TO DEFAULT"
+WAIT_AS_EVER = f"SELECT pg_catalog.set_config('lock_timeout', pg_catalog.current_setting('{LOCK_TIMEOUT}'), true)"
 
 _NEW = f"{VIEWS}_new"
 

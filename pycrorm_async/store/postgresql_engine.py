@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import Any
 
 from sqlalchemy import URL, event
@@ -18,6 +19,21 @@ ANSWER_S_MAX = 60.0
 
 WARNING = "pycrorm_warning"
 """Key in a connection's `info` for the server's latest warning."""
+
+LOCK_TIMEOUT = "pycrorm.lock_timeout"
+"""A setting of the session: its `lock_timeout`, for a statement that changes it for a while."""
+
+POOLED = (
+    "a pooler between the memory and the server gives one session of the server to several clients: set pool_mode ="
+    " session and server_reset_query = DISCARD ALL for this database in pgbouncer, or connect to the server itself"
+)
+"""The refusal of a pooler, which would lose or exchange what belongs to a session: search path, locks, statements."""
+
+_FRESH = f"""
+DO $$ BEGIN IF pg_catalog.current_setting('{LOCK_TIMEOUT}', true) OPERATOR(pg_catalog.<>) '' THEN
+    RAISE EXCEPTION '{POOLED}' USING ERRCODE = 'connection_exception';
+END IF; END $$"""
+"""Refuses a session of the server in which another connection of this package has been at work."""
 
 _VANISHED = {
     "tcp_keepalives_idle": "10",
@@ -67,15 +83,16 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
     unavailable. A read-only engine refuses writes.
     """
     settings = {
-        "application_name": "pycrorm",
         "search_path": "pg_catalog",  # until `PIN` sets it
         "synchronous_commit": "on",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
         "lock_timeout": f"{int(busy_timeout_s * 1000)}",
+        LOCK_TIMEOUT: f"{int(busy_timeout_s * 1000)}",
         "idle_in_transaction_session_timeout": "60000",
         **_VANISHED,
         "default_transaction_read_only": "on" if read_only else "off",
         "timezone": "UTC",
     }
+    script = "; ".join([_FRESH, *(f"SET {name} = '{value}'" for name, value in settings.items()), PIN])
     # The driver reads these only from a URL; other parts of the URL are passed as arguments, which take precedence.
     tls = {name: value for name, value in url.query.items() if name in TLS}
     for name in sorted(_TLS_FILES & tls.keys()):
@@ -88,7 +105,8 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
             **dsn,
             "timeout": busy_timeout_s,
             "command_timeout": ANSWER_S_MAX,
-            "server_settings": settings,
+            "async_creator_fn": partial(_connect, script),
+            "server_settings": {"application_name": "pycrorm"},
             # A cached plan fails once after its view gets a column, which happens with every new type.
             "prepared_statement_cache_size": 0,
         },
@@ -96,19 +114,34 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
         pool_pre_ping=True,
         hide_parameters=True,
     )
-    event.listen(engine.sync_engine, "connect", _set_up)
+    event.listen(engine.sync_engine, "connect", _keep_warnings)
     return engine
 
 
-def _set_up(connection: Any, record: ConnectionPoolEntry) -> None:
-    """Pin the search path of a new connection, and keep the server's latest warning in its `info`."""
+async def _connect(script: str, *arguments: Any, **named: Any) -> Any:
+    """Connect, and execute the script before any other statement.
+
+    The settings are statements, because pgbouncer refuses a connection that asks for them at its start.
+    """
+    import asyncpg  # takes a tenth of a second
+
+    connection = await asyncpg.connect(*arguments, **named)
+    try:
+        await connection.execute(script, timeout=named["timeout"])  # a full pool lets clients in, and then wait
+    except BaseException:
+        connection.terminate()
+        raise
+    return connection
+
+
+def _keep_warnings(connection: Any, record: ConnectionPoolEntry) -> None:
+    """Keep the server's latest warning to a new connection in its `info`."""
 
     def keep(_: Any, message: Any) -> None:
         if getattr(message, "severity_en", None) == "WARNING":
             record.info[WARNING] = " ".join(str(message).split())
 
     connection.driver_connection.add_log_listener(keep)
-    connection.run_async(lambda driver: driver.execute(PIN))
 
 
 # === search path ==============================================================================================

@@ -17,6 +17,7 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, InterfaceError
 
 from pycrorm_async.errors import CallerError, DamageError, DatabaseUnavailable, InternalError, PycrormError
 from pycrorm_async.store.dialect import RowRefused
+from pycrorm_async.store.postgresql_engine import POOLED
 
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
@@ -54,6 +55,8 @@ _UNAVAILABLE = (
 _DEFINITIONS = ("22", "42", "54")
 """Errors of an impossible definition: a value, syntax, a name or a server limit. `_UNAVAILABLE` takes precedence."""
 _DAMAGED = ("XX001", "XX002")
+_EXCHANGED = ("26000", "42P05")
+"""A prepared statement of this session does not exist, or exists in a session that never prepared it."""
 _MISSING = ("42P01", "3F000", "42P10")
 """A table, a schema, or the key of a table is missing."""
 _OF_THE_MEMORY = re.compile(
@@ -93,6 +96,8 @@ def translate_error(error: Exception, database: str) -> PycrormError:
         return DamageError(f"{database} is damaged: {text}")
     if _is_missing(code, text):
         return DatabaseUnavailable(f"{database}: {text}: a part of the memory is missing; restore it from a backup")
+    if code in _EXCHANGED:
+        return DatabaseUnavailable(f"{database}: {text}: {POOLED}")
     if code == _NO_RIGHT:
         return DatabaseUnavailable(
             f"{database}: {text}: use a login with this right (operations/README.md, PostgreSQL)"
