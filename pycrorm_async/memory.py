@@ -28,9 +28,10 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterable, AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager
+from contextvars import copy_context
 from dataclasses import replace
 from functools import partial, wraps
 from os import PathLike
@@ -75,6 +76,7 @@ if TYPE_CHECKING:
     from pycrorm_async.query.picture import MomentReference
     from pycrorm_async.recall import Answer, Recall
     from pycrorm_async.record import Episode
+    from pycrorm_async.record.camera import CameraStream
     from pycrorm_async.report import Report
     from pycrorm_async.report.pictures import Images
 
@@ -395,6 +397,45 @@ class Memory:
         Raises `Unrecordable` with `on_unrecordable="refuse"` only.
         """
         (self._forked_parts or self._open_parts).recorder.observe(name, values, node=node)
+
+    def observe_camera(
+        self,
+        name: str,
+        frames: AsyncIterable[object] | None = None,
+        *,
+        hz: float = 2.0,
+        bytes_per_s: float = 4e6,
+        node: TaskTreeNode | None = None,
+    ) -> CameraStream:
+        """Record the images of a camera as observations, without slowing the plan.
+
+        >>> with memory.observe_camera("front", camera.frames(), hz=2):
+        ...     await plan()
+        >>> front = memory.observe_camera("front")
+        >>> driver.on_image(front.put)
+
+        Images between two episodes are not recorded. One that is due and finds no room, because images take more than
+        `bytes_per_s` or half of the spool, or come faster than they are recorded, is left out; the oldest first.
+
+        Args:
+            name: by which observations are queried.
+            frames: an async iterator of images, which a task of this loop reads until the block ends; without it, give
+                each image to `put`, from any thread. `CameraStream.put` lists what can be an image.
+            hz, bytes_per_s: at most so many images and bytes are recorded in a second.
+            node: the node that observes; by default the current one, or the root of the episode.
+
+        Raises `CallerError` for an argument that does not fit.
+        """
+        from pycrorm_async.record.camera import CameraStream
+
+        parts = self._forked_parts or self._open_parts
+        context, recorder = copy_context(), parts.recorder
+
+        def record_image(image: object) -> bool:
+            return context.run(recorder.record_image, name, node, image)
+
+        stream = CameraStream(name, record_image, parts.emitter, self._clock, hz, bytes_per_s)
+        return stream if frames is None else stream.read(frames)
 
     # --- subscribing ------------------------------------------------------------------------------------------
 

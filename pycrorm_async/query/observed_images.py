@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.events.types import BLOB_KEY
+from pycrorm_async.record.camera import image_type as image_type
 from pycrorm_async.record.values import NPY
 
 Kind = Literal["image", "depth", "points"]
 
-_SIGNATURES: Final = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg", b"GIF8": "image/gif"}
-_SIGNATURES_OF_WEBP: Final = b"RIFF", b"WEBP"
 _PCD_TYPES: Final = ("application/pcd", "application/x-pcd", "model/pcd", "text/x-pcd", "image/x-pcd")
 _ITEMS_MAX: Final = 8
 """Bounds the numbers of a list that have curves: as many as a wrench, a quaternion or the joints of an arm have."""
@@ -111,16 +110,6 @@ def numbers_in(name: str, values: Any) -> list[tuple[str, float]]:
 
 
 # === images ===================================================================================================
-
-
-def image_type(content: bytes) -> str:
-    """Return the media type of an encoded image by its first bytes. Raises `ValueError` for other contents."""
-    for signature, media_type in _SIGNATURES.items():
-        if content.startswith(signature):
-            return media_type
-    if (content[:4], content[8:12]) == _SIGNATURES_OF_WEBP:
-        return "image/webp"
-    raise ValueError("it is no PNG, JPEG, GIF or WebP image")
 
 
 def array_of(content: bytes) -> NDArray[Any]:

@@ -534,6 +534,11 @@ class EventSink(Protocol):
         """True if the queue would refuse an event without `reserved` now."""
         ...
 
+    @property
+    def bytes_spooled(self) -> int:
+        """Bytes of all that is not deleted yet."""
+        ...
+
     def room(self) -> Awaitable[None]:
         """Wait until an event without `reserved` fits again."""
         ...

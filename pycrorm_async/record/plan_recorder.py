@@ -36,6 +36,7 @@ from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.plan.task import TaskTreeNode, current_node
 from pycrorm_async.record import episode_writer, values
+from pycrorm_async.record.camera import put_image
 from pycrorm_async.record.objects import ObjectRows
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, current_task
 from pycrorm_async.record.plan_types import Declarations
@@ -383,6 +384,11 @@ class Recorder:
             return
         self._guarded("Observed", lambda: self._observe(name, values, node, may_refuse=True))
 
+    def record_image(self, name: str, node: TaskTreeNode | None, image: object) -> bool:
+        """Record an image as an observation in the episode that is open here, if one is; return whether it did."""
+        episode, acting = self._observer(node)
+        return episode is not None and put_image(episode, name, image, episode.node_or_root(acting))
+
     def keep(self, name: str, key: str, content: Callable[[], event_types.Blob]) -> None:
         """Record a content that nodes name by this key, once for all episodes of the memory.
 
@@ -397,19 +403,21 @@ class Recorder:
 
     def _observe(self, name: str, values: object, node: TaskTreeNode | None, *, may_refuse: bool) -> int:
         """Return the sequence of the event; 0 if it was counted as missing."""
-        own = self.episode_here()
-        episode: episode_writer.EpisodeWriter | None
-        if node is not None:
-            record: NodeRecord | None = node.record
-            episode = record.episode if record is not None and record.episode.id in self.episodes.by_id else None
-        elif own is not None:
-            episode, node = own, current_node.get()
-        else:
-            episode = self.episodes.last_opened()
+        episode, acting = self._observer(node)
         if episode is None:
             self._emitter.missing.note("observation", episode_writer.name_of(name), "no episode is open")
             return 0
-        return episode_writer.put_observation(episode, name, values, episode.node_or_root(node), may_refuse=may_refuse)
+        at = episode.node_or_root(acting)
+        return episode_writer.put_observation(episode, name, values, at, may_refuse=may_refuse)
+
+    def _observer(self, node: TaskTreeNode | None) -> tuple[episode_writer.EpisodeWriter | None, TaskTreeNode | None]:
+        """Return the open episode that observes here, and its node; with `node`, those of this node."""
+        if node is not None:
+            record: NodeRecord | None = node.record
+            return record.episode if record is not None and record.episode.id in self.episodes.by_id else None, node
+        if (own := self.episode_here()) is not None:
+            return own, current_node.get()
+        return self.episodes.last_opened(), None
 
     # --- inside -----------------------------------------------------------------------------------------------
 

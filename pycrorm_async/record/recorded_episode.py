@@ -11,11 +11,13 @@ from typing import Any, Concatenate, Literal, Self, TypeAlias, get_args
 
 from msgspec.structs import replace
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.fields import checked_tags
-from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.ids import EpisodeId, is_named
 from pycrorm_async.events.types import ObjectDetected
 from pycrorm_async.record.arguments import ArgumentReader, Convert, RecordedValues, pose_of, struct_of
+from pycrorm_async.record.camera import CameraStream, put_image
 from pycrorm_async.record.declarations import DeclaredType
 from pycrorm_async.record.episode_writer import Emitter, EpisodeWriter, OpenEpisodes, is_of_memory, name_of
 from pycrorm_async.record.event_times import At
@@ -417,6 +419,24 @@ class RecordedEpisode:
         """Record an observation; `Memory.observe` describes name and values."""
         copied = self._values.converted(values)
         return self._timed("Observed", at, lambda: self._writer.observe(name, copied, node))
+
+    def observe_camera(
+        self, name: str, frames: Any = None, *, hz: float = 2.0, bytes_per_s: float = 4e6, node: Hashable | None = None
+    ) -> CameraStream:
+        """Record the images of a camera until the episode ends; see `Memory.observe_camera`.
+
+        Raises `CallerError` for an argument that does not fit, and in an episode with a name or times of its own, whose
+        images `observe` records.
+        """
+        if self._writer.events.time is not None or is_named(self.id):
+            raise CallerError("this episode has a name or times of its own: record each image with `observe`")
+        writer, acting = self._writer, self._writer.find(node, "Observed")
+
+        def record(image: object) -> bool:  # not in `write`, so that no call of the executive waits for an image
+            return put_image(writer, name, image, writer.node_or_root(acting))
+
+        stream = CameraStream(name, record, self.emitter, self._episodes.clock, hz, bytes_per_s)
+        return stream if frames is None else stream.read(frames)
 
     @reported("Observed")
     def sampled(

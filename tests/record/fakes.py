@@ -35,6 +35,7 @@ class ListSink:
         self.blobs: dict[str, bytes] = {}
         self.released: list[str] = []
         self.full = False
+        self.bytes_spooled = 0
         self.broken = False
         self.broken_starts = 0
         self.space = asyncio.Event()
