@@ -56,6 +56,13 @@ def learn(
     ] = 2_000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers; it determines the rollouts.")] = 69,
     workers: Annotated[int, typer.Option(min=1, help="Processes, each with its own world.")] = 1,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Instead of --workers: a Dask scheduler, as tcp://lab:8786, whose workers perform the rollouts.",
+        ),
+    ] = None,
     min_samples_leaf: Annotated[
         int, typer.Option(min=2, help="Successes in a leaf of the tree; small leaves repeat the successes exactly.")
     ] = 25,
@@ -89,7 +96,9 @@ def learn(
 ) -> None:
     """Record random pick-ups, learn a policy from the successful ones, and evaluate it.
 
-    The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra 'learning'.
+    The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra 'learning'. On the
+    machines of a --cluster (extra 'cluster') each worker records into the spool of its machine, which a `pycrorm
+    writer` there stores; the same rollouts end alike with any number of workers.
     """
     # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts; of them
     # that of the packages comes last, because importing them takes half a second.
@@ -104,10 +113,11 @@ def learn(
         min_samples_leaf=min_samples_leaf,
         scene=Scene(limits=limits, collisions=collisions),
         workers=workers,
+        cluster=cluster,
         episode_each=episode_each,
         resume=resume,
     )
-    _check_packages()
+    _check_packages(cluster)
     location = MemoryLocation(*place)
     with progress_bar("rollouts", unit="rollouts") as bar:
 
@@ -130,16 +140,17 @@ def learn(
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
 
 
-def _check_packages() -> None:
-    for module, package in (
-        ("jpt", "pyjpt (for Python up to 3.12)"),
-        ("matplotlib", "matplotlib"),
-        ("pandas", "pandas"),
+def _check_packages(cluster: str | None) -> None:
+    for module, package, extra in (
+        ("jpt", "pyjpt (for Python up to 3.12)", "learning"),
+        ("matplotlib", "matplotlib", "learning"),
+        ("pandas", "pandas", "learning"),
+        *([("distributed", "distributed", "cluster")] if cluster is not None else []),
     ):
         try:
             importlib.import_module(module)
         except ImportError:
-            raise MissingExtra(f"{package} is not installed: pip install 'pycrorm-async[learning]'") from None
+            raise MissingExtra(f"{package} is not installed: pip install 'pycrorm-async[{extra}]'") from None
     engine_class()  # raises `EngineMissing`
 
 
@@ -283,6 +294,7 @@ def _document(
     return {
         "seed": experiment.seed,
         "workers": experiment.workers,
+        "cluster": experiment.cluster,
         "scene": str(experiment.scene),
         "phases": [
             {

@@ -17,9 +17,10 @@ from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
+from pycrorm_async.learning.cluster import RolloutPool, rollout_pool
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy, name_of
-from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask, Workers
+from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask
 from pycrorm_async.learning.recorded_policy import record_policy
 from pycrorm_async.learning.rollouts import Tally, tally_of
 from pycrorm_async.learning.scenes import Scene
@@ -56,6 +57,7 @@ class Experiment:
         min_samples_leaf: minimum number of samples in a leaf of the tree.
         scene: the scene of every rollout.
         workers: number of worker processes.
+        cluster: address of the scheduler of a Dask cluster whose workers perform the rollouts instead.
         episode_each: record each rollout as an episode of its own; otherwise a few hundred share one.
         resume: continue from the recorded rollouts of the same experiment; otherwise none may be recorded.
     """
@@ -68,6 +70,7 @@ class Experiment:
     min_samples_leaf: int = 25
     scene: Scene = field(default_factory=Scene)
     workers: int = 1
+    cluster: str | None = None
     episode_each: bool = False
     resume: bool = False
 
@@ -151,7 +154,7 @@ class _PhaseRunner:
         self,
         experiment: Experiment,
         place: MemoryLocation,
-        workers: Workers,
+        workers: RolloutPool,
         reading: Reading,
         report_progress: ReportProgress,
     ) -> None:
@@ -248,7 +251,10 @@ async def run(
 
     # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
     await recover(place.url, spool=place.spool)
-    async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
+    async with (
+        rollout_pool(experiment.workers, experiment.cluster, place) as workers,
+        Reading.open(place.url) as reading,
+    ):
         runner = _PhaseRunner(experiment, place, workers, reading, report_progress)
         policy, frames = default_policy(), []
         for number in range(experiment.rounds):
@@ -388,7 +394,7 @@ async def study(
             await read_rollouts(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
             for phase in (learned.default, learned.evaluation, learned.held_out)
         ]
-    async with Workers(experiment.workers, None) as workers:
+    async with rollout_pool(experiment.workers, experiment.cluster, None) as workers:
         evaluator = _Evaluator(experiment, workers, rollouts, report_progress)
         return Study(
             tuple([each async for each in evaluator.curve(default, held_out)]),
@@ -408,7 +414,7 @@ class _Evaluator:
     """Run the evaluation's rollouts in workers that record nothing."""
 
     def __init__(
-        self, experiment: Experiment, workers: Workers, rollouts: int, report_progress: ReportProgress
+        self, experiment: Experiment, workers: RolloutPool, rollouts: int, report_progress: ReportProgress
     ) -> None:
         self._experiment = experiment
         self._workers = workers

@@ -116,7 +116,7 @@ class Workers:
     async def __aenter__(self) -> Self:
         try:
             if self._place is not None:
-                self._daemon.append(await self._stack.enter_async_context(_run_daemon(self._place)))
+                self._daemon.append(await self._stack.enter_async_context(run_daemon(self._place)))
             for _ in range(self._count):
                 process = ChildProcess.start(_run_worker, "pycrorm rollouts", self._place, dies_with_parent=False)
                 self._processes.append(process)
@@ -217,7 +217,7 @@ def _describe_exit(code: int | None) -> str:
 
 
 @asynccontextmanager
-async def _run_daemon(place: MemoryLocation) -> AsyncIterator[asyncio.Task[None]]:
+async def run_daemon(place: MemoryLocation) -> AsyncIterator[asyncio.Task[None]]:
     """Drain the workers' recorders until the context ends, except while another daemon drains the spool.
 
     Yields the task of the daemon, which ends early only with an error. Raises the errors of `serve`.
@@ -304,6 +304,20 @@ async def _run(pipe: Connection, job: RolloutTask, first: int, count: int, memor
             with suppress(OSError):  # the parent is dead: `stop` sees the end of file too
                 pipe.send(("so far", tally))
 
+    # During a run the parent sends nothing but `stop`.
+    return await perform_run(job, first, count, memory, stop=pipe.poll, report_progress=report)
+
+
+async def perform_run(
+    job: RolloutTask,
+    first: int,
+    count: int,
+    memory: Memory | None,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    report_progress: Callable[[Tally], None] = lambda _: None,
+) -> Tally:
+    """Perform the rollouts with these indexes in a world of their own, recorded in this memory."""
     async with AsyncExitStack() as stack:
         if memory is not None and not job.episode_each:
             description = f"rollouts {first} to {first + count - 1} under policy {name_of(job.policy)}"
@@ -318,6 +332,6 @@ async def _run(pipe: Connection, job: RolloutTask, first: int, count: int, memor
             reset=stage.reset,
             prepare=stage.prepare if job.scene.varies else None,
             each_in=memory if job.episode_each else None,
-            stop=pipe.poll,  # during a run the parent sends nothing but `stop`
-            report_progress=report,
+            stop=stop,
+            report_progress=report_progress,
         )
