@@ -89,6 +89,7 @@ class LogAndTables:
         self._numbers = EpisodeNumbers((spool or Path()) / STORED / log.log_id)
         self._heads: dict[EpisodeId, int] | None = None  # confirmed, the last one last; None before a comparison
         self._comparing = asyncio.Lock()
+        self._folding = asyncio.Lock()
 
     async def open_tables(self) -> None:
         """Open the tables. Raises the errors of `Projector.open` but `TablesForeign`: each fold opens them again."""
@@ -235,25 +236,28 @@ class LogAndTables:
             await self.group.leave()
 
     async def fold_next_batch(self) -> bool:
-        async with self.group.folding() as share, self._tables():
+        async with self._tables(), self.group.folding() as share:
             return await self._projector.fold_next_batch(share)
 
     async def has_unfolded(self) -> bool:
         share = await self.group.share()
-        some = await self.group.read(EpisodeRow, SELECT_BEHIND, after=0, limit=1, **share._asdict())
-        return bool(some) or await self.group.is_stalled()
+        return bool(await self.group.read(EpisodeRow, SELECT_BEHIND, after=0, limit=1, **share._asdict()))
 
     @asynccontextmanager
     async def _tables(self) -> AsyncIterator[None]:
-        """Open the tables again after a failed fold or a healed log, because their layout may have changed."""
-        if self._refused:
-            await self._projector.open()
-            self._refused = False
-        try:
-            yield
-        except Exception:
-            self._refused = True
-            raise
+        """Let one task fold at a time: one whose task heals the log does so beside the one that always folds.
+
+        Opens the tables again after a failed fold or a healed log, because their layout may have changed.
+        """
+        async with self._folding:
+            if self._refused:
+                await self._projector.open()
+                self._refused = False
+            try:
+                yield
+            except Exception:
+                self._refused = True
+                raise
 
     async def behind(self) -> Mapping[str, int]:
         return {each.id: each.folded for each in await self._episodes_behind()}

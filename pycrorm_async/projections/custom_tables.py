@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 from sqlalchemy import Dialect
@@ -22,7 +23,6 @@ from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections import pipeline as checkpoints
 from pycrorm_async.projections.columns import OWN, Layout, Storage, next_number
 from pycrorm_async.projections.custom import CustomRows, EpisodeFolds, PackedProjection, Projection, columns_of
-from pycrorm_async.projections.fold_group import OtherShares
 from pycrorm_async.projections.generations import (
     PROJECTION,
     Generation,
@@ -44,6 +44,7 @@ from pycrorm_async.projections.pipeline import (
     SideTarget,
 )
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow
 
 _log = logging.getLogger("pycrorm_async.projections")
 _CHECK_S = 1.0
@@ -312,3 +313,56 @@ async def states(log: EventLog, projections: Sequence[Projection]) -> list[Proje
 
 def _names(layout: Layout) -> list[str]:
     return [name.removeprefix(OWN).lower() for name in (*layout.leaves, *layout.user_views)]
+
+
+# === other shares =============================================================================================
+#
+# A process has a share of the episodes of each projection too (`fold_group`), but another process may not have the
+# projection's code. If no episode of a share has moved between two comparisons `_STALL_S` apart, this process folds all
+# shares for `_HELP_S`.
+
+_STALL_S: Final = 20.0
+"""The time in which a process that folds has folded something: a batch takes a second, or ten on a busy machine."""
+_HELP_S: Final = 30.0
+"""The time for which all shares are folded when a process does not fold its own, until that is examined again."""
+
+
+class OtherShares:
+    """The shares of other processes, and whether one of them is not folded by its process."""
+
+    def __init__(self) -> None:
+        self._behind: Mapping[int, int] = {}
+        self._compared_s = self._help_until_s = float("-inf")
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the episodes that are behind should be compared now."""
+        return time.monotonic() >= self._compared_s + _STALL_S
+
+    def compare(self, behind: Sequence[EpisodeRow], own: Share) -> Share:
+        """Compare with the episodes that were behind at the last call; return as `folded_with` does."""
+        now = {each.number: each.folded for each in behind}
+        self._compared_s = time.monotonic()
+        if is_stalled(self._behind, now, own.many):
+            self._help_until_s = self._compared_s + _HELP_S
+        self._behind = now
+        return self.folded_with(own)
+
+    def folded_with(self, own: Share) -> Share:
+        """Return the share to fold: the own one, or all of them while one of the others is not folded."""
+        return WHOLE if time.monotonic() < self._help_until_s else own
+
+
+def is_stalled(before: Mapping[int, int], now: Mapping[int, int], many: int) -> bool:
+    """Return whether all episodes of one of `many` shares that were behind have not been folded further.
+
+    Args:
+        before: by number, the folded sequence of the episodes that were behind.
+        now: the same, later.
+        many: the number of shares.
+
+    >>> is_stalled({1: 5, 2: 7}, {1: 6, 2: 7}, 2), is_stalled({1: 5, 2: 7, 4: 9}, {1: 6, 2: 7}, 2)
+    (True, False)
+    """
+    moving = {number % many for number, folded in before.items() if now.get(number) != folded}
+    return any(number % many not in moving for number in before)

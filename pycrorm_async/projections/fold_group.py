@@ -12,10 +12,10 @@ process lists the holders once a second, and folds the episodes whose number mod
 among them. There is no leader and no table, and so nothing to repair: while two processes disagree on the
 group, an episode is folded twice at most, and one of the two is rolled back.
 
-A process that stays in the group and does not fold, because it is stopped, or its machine has lost its power, does not
-keep the events of its share from the tables. If no episode of a share has moved between two looks `_STALL_S` apart, a
-process that has nothing else to do folds all shares for `_HELP_S`. The same holds for each custom projection, whose
-code other processes may not have.
+A process whose session stays and that does not fold, because it or its fold worker is stopped, or its machine has lost
+its power, does not keep the events of its share from the tables. With each look a process takes a second lock, whose
+key is the number of the look, and releases the one before. A process that the others see with the same number for
+`_STALL_S` is not counted until it looks again. Only this process' own clock measures that time.
 
 SQLite has one writer at a time, and no group.
 """
@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, Final
 
@@ -34,17 +34,12 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.projections.pipeline import WHOLE, Share
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.schema import SELECT_BEHIND
-from pycrorm_async.store.stored import EpisodeRow
 
 _LOOK_S: Final = 1.0
 """Interval between two looks at the group, 0.2 ms each, and so the time until the share of a dead process is taken."""
-_STALL_S: Final = 20.0
-"""The time in which a process that folds has folded something: a batch takes a second, or ten on a busy machine."""
-_HELP_S: Final = 30.0
-"""The time for which all shares are folded when a process does not fold its own, until that is examined again."""
-_COMPARED_MAX: Final = 1_000
-"""Bounds the episodes that are compared, those with the lowest numbers."""
+_STALL_S: Final = 10.0
+"""The time after which a process that has not looked does not count: longer than a batch takes on a busy machine, and
+so short that a flush, which waits for 15 s, does not end before another process has folded what it waits for."""
 
 
 class FoldGroup:
@@ -55,7 +50,10 @@ class FoldGroup:
         self._session: AsyncConnection | None = None
         self._own = WHOLE
         self._looked_s = float("-inf")
-        self._others = OtherShares()
+        self._look_number = 0
+        self._seen: Mapping[
+            int, tuple[int | None, float]
+        ] = {}  # by process id, its last look, and when it was new here
         self._turn = asyncio.Lock()  # a session executes one statement at a time
 
     async def share(self) -> Share:
@@ -65,7 +63,7 @@ class FoldGroup:
             async with self._turn:
                 self._own = await self._look()
             self._looked_s = now_s
-        return self._others.folded_with(self._own)
+        return self._own
 
     @asynccontextmanager
     async def folding(self) -> AsyncIterator[Share]:
@@ -77,13 +75,6 @@ class FoldGroup:
             await self.leave()
             raise
 
-    async def is_stalled(self) -> bool:
-        """Return whether a share is not folded by its process, from now on by this one. Compares at intervals."""
-        if self._own == WHOLE or not self._others.is_due:
-            return False
-        behind = await self.read(EpisodeRow, SELECT_BEHIND, after=0, limit=_COMPARED_MAX, **WHOLE._asdict())
-        return self._others.compare(behind, self._own) == WHOLE
-
     async def read(self, kind: Any, statement: Executable, **values: Any) -> list[Any]:
         """Read as `EventLog.read` does, in a member in its session, for a quarter of the processor time."""
         async with self._turn:
@@ -93,11 +84,15 @@ class FoldGroup:
                 with self._log.translated():
                     return await dialect_of(self._session).rows(self._session, kind, statement, **values)
             except BaseException:
-                await self.leave()
+                await self._end_session()
                 raise
 
     async def leave(self) -> None:
         """Leave the group by ending the session."""
+        async with self._turn:
+            await self._end_session()
+
+    async def _end_session(self) -> None:
         session, self._session = self._session, None
         self._own, self._looked_s = WHOLE, float("-inf")
         if session is not None:
@@ -111,48 +106,18 @@ class FoldGroup:
                     session = await self._log.engine.connect()
                     # Autocommit, because an idle transaction would be terminated; the lock belongs to the session.
                     self._session = await session.execution_options(isolation_level="AUTOCOMMIT")
-                return Share(*await dialect_of(self._session).join_fold_group(self._session))
+                    self._seen = {}
+                self._look_number += 1
+                own, looks = await dialect_of(self._session).join_fold_group(self._session, self._look_number)
         except BaseException:
-            await self.leave()
+            await self._end_session()
             raise
-
-
-class OtherShares:
-    """The shares of other processes, and whether one of them is not folded by its process."""
-
-    def __init__(self) -> None:
-        self._behind: Mapping[int, int] = {}
-        self._compared_s = self._help_until_s = float("-inf")
-
-    @property
-    def is_due(self) -> bool:
-        """Whether the episodes that are behind should be compared now."""
-        return time.monotonic() >= self._compared_s + _STALL_S
-
-    def compare(self, behind: Sequence[EpisodeRow], own: Share) -> Share:
-        """Compare with the episodes that were behind at the last call; return as `folded_with` does."""
-        now = {each.number: each.folded for each in behind}
-        self._compared_s = time.monotonic()
-        if is_stalled(self._behind, now, own.many):
-            self._help_until_s = self._compared_s + _HELP_S
-        self._behind = now
-        return self.folded_with(own)
-
-    def folded_with(self, own: Share) -> Share:
-        """Return the share to fold: the own one, or all of them while one of the others is not folded."""
-        return WHOLE if time.monotonic() < self._help_until_s else own
-
-
-def is_stalled(before: Mapping[int, int], now: Mapping[int, int], many: int) -> bool:
-    """Return whether all episodes of one of `many` shares that were behind have not been folded further.
-
-    Args:
-        before: by number, the folded sequence of the episodes that were behind.
-        now: the same, later.
-        many: the number of shares.
-
-    >>> is_stalled({1: 5, 2: 7}, {1: 6, 2: 7}, 2), is_stalled({1: 5, 2: 7, 4: 9}, {1: 6, 2: 7}, 2)
-    (True, False)
-    """
-    moving = {number % many for number, folded in before.items() if now.get(number) != folded}
-    return any(number % many not in moving for number in before)
+        now_s = time.monotonic()
+        seen = {each: self._seen.get(each, (None, 0.0)) for each in looks}
+        self._seen = {each: seen[each] if seen[each][0] == look else (look, now_s) for each, look in looks.items()}
+        active = [
+            each
+            for each, (look, since_s) in sorted(self._seen.items())
+            if each == own or look is None or now_s <= since_s + _STALL_S  # a process of an earlier version has no look
+        ]
+        return Share(active.index(own), len(active))

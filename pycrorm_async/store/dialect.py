@@ -42,6 +42,8 @@ DECLARATIONS = LOG_CHANGES + 2
 """Key of the lock that transactions with new declarations take."""
 FOLDING = LOG_CHANGES + 3
 """Key of the lock that every session shares whose process folds by share (`projections.fold_group`)."""
+FOLDING_LOOKS = FOLDING & 0x7FFFFFFF
+"""First part of the keys of the locks that show when these processes looked; the second is the number of the look."""
 
 
 MADE = re.compile(r"__\d+$")
@@ -270,9 +272,16 @@ class Dialect(ABC):
         Returns False if one is missing; the caller must not use the transaction any more then.
         """
 
-    async def join_fold_group(self, connection: AsyncConnection) -> tuple[int, int]:  # noqa: ARG002
-        """Join the sessions of those that fold this memory; return the place among them, from 0, and their number."""
-        return 0, 1
+    async def join_fold_group(
+        self,
+        connection: AsyncConnection,  # noqa: ARG002
+        look: int,
+    ) -> tuple[int, Mapping[int, int | None]]:
+        """Join the sessions of those that fold this memory, and show the number of this look.
+
+        Returns the id of this session, and by id the numbers that all of them show; None in an earlier version.
+        """
+        return 0, {0: look}
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:  # noqa: ARG002
         """Return the errors that the database finds in its own pages, if it can check them."""

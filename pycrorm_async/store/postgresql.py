@@ -70,12 +70,15 @@ CLAIM = f"SELECT pg_catalog.pg_try_advisory_lock({dialect.LOG_CHANGES + 1})"
 RELEASE = f"SELECT pg_catalog.pg_advisory_unlock({dialect.LOG_CHANGES + 1})"
 
 JOIN_FOLDING = f"SELECT pg_catalog.pg_advisory_lock_shared({dialect.FOLDING})"
-PLACE_IN_FOLDING = f"""
-SELECT count(*) FILTER (WHERE pid < pg_catalog.pg_backend_pid()), count(*),
-count(*) FILTER (WHERE pid = pg_catalog.pg_backend_pid())
-FROM pg_catalog.pg_locks WHERE locktype = 'advisory' AND granted AND objsubid = 1
-AND (classid::bigint << 32 | objid::bigint) = {dialect.FOLDING}
-AND database = (SELECT oid FROM pg_catalog.pg_database WHERE datname = pg_catalog.current_database())"""
+SHOW_LOOK = f"SELECT pg_catalog.pg_advisory_lock_shared({dialect.FOLDING_LOOKS}, $1::int)"
+FORGET_LOOK = f"SELECT pg_catalog.pg_advisory_unlock_shared({dialect.FOLDING_LOOKS}, $1::int)"
+SELECT_LOOKS = f"""
+SELECT pid, pg_catalog.max(objid::bigint) FILTER (WHERE objsubid = 2), pid = pg_catalog.pg_backend_pid()
+FROM pg_catalog.pg_locks WHERE locktype = 'advisory' AND granted
+AND database = (SELECT oid FROM pg_catalog.pg_database WHERE datname = pg_catalog.current_database())
+AND (objsubid = 1 AND (classid::bigint << 32 | objid::bigint) = {dialect.FOLDING}
+    OR objsubid = 2 AND classid = {dialect.FOLDING_LOOKS})
+GROUP BY pid HAVING pg_catalog.bool_or(objsubid = 1)"""
 
 # Less than deadlock_timeout, so that the session that changes tables fails, never a reader.
 WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
@@ -398,12 +401,16 @@ class PostgreSQL(dialect.Dialect):
             raise
         return True
 
-    async def join_fold_group(self, connection: AsyncConnection) -> tuple[int, int]:
-        place, count, is_member = tuple((await connection.exec_driver_sql(PLACE_IN_FOLDING)).one())
-        if not is_member:
+    async def join_fold_group(self, connection: AsyncConnection, look: int) -> tuple[int, Mapping[int, int | None]]:
+        await connection.exec_driver_sql(SHOW_LOOK, (look,))
+        rows = [tuple(row) for row in await connection.exec_driver_sql(SELECT_LOOKS)]
+        if any(is_own for _, _, is_own in rows):
+            await connection.exec_driver_sql(FORGET_LOOK, (look - 1,))
+        else:
             await connection.exec_driver_sql(JOIN_FOLDING)
-            place, count, _ = tuple((await connection.exec_driver_sql(PLACE_IN_FOLDING)).one())
-        return place, count
+            rows = [tuple(row) for row in await connection.exec_driver_sql(SELECT_LOOKS)]
+        [own] = [process for process, _, is_own in rows if is_own]
+        return own, {process: number for process, number, _ in rows}
 
     # --- tables and views ---------------------------------------------------------------------------------------
 

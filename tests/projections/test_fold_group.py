@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.operations.destination import LogAndTables, open_destination
 from pycrorm_async.projections import fold_group
-from pycrorm_async.projections.fold_group import is_stalled
+from pycrorm_async.projections.custom_tables import is_stalled
 from pycrorm_async.projections.pipeline import WHOLE, Share
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
@@ -85,7 +86,7 @@ async def test_each_folds_the_episodes_of_its_share_and_sees_those_of_the_others
         assert len(await each.behind()) == 30 - 10 * count
 
 
-async def test_the_share_of_a_process_that_does_not_fold_is_folded_by_another(
+async def test_the_share_of_a_process_that_does_not_look_is_folded_by_another_until_it_looks_again(
     folders: list[LogAndTables], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, idle, _ = folders
@@ -100,6 +101,20 @@ async def test_the_share_of_a_process_that_does_not_fold_is_folded_by_another(
     while await folder.fold_next_batch():
         pass
     assert await folder.behind() == {}
+    monkeypatch.setattr(fold_group, "_STALL_S", 10.0)
+    assert (await idle.group.share()).many == (await folder.group.share()).many == 2
+
+
+async def test_a_fold_of_all_is_whole_beside_the_task_that_folds_a_share(folders: list[LogAndTables]) -> None:
+    """As that of a log that was healed, while the daemon folds."""
+    folder, idle, _ = folders
+    await shares_of([folder, idle])
+    for first in range(1, 200, 20):
+        await folder.append([started(each) for each in range(first, first + 20)])
+        folding = asyncio.create_task(folder.fold())
+        while not folding.done():
+            await folder.fold_next_batch()
+        assert await folder.behind() == {}
 
 
 async def test_a_process_that_cannot_fold_leaves_its_share_to_the_others(
@@ -156,6 +171,31 @@ def test_a_share_is_stalled_if_none_of_its_episodes_has_moved() -> None:
     assert is_stalled({1: 5, 2: 7}, {1: 6, 2: 7}, 2)
     assert not is_stalled({1: 5, 2: 7, 4: 9}, {1: 6, 2: 7}, 2)  # 4 is folded
     assert not is_stalled({}, {1: 6}, 2)
+
+
+@pytest.mark.soak
+def test_a_flush_ends_while_another_daemon_is_stopped(database_url: str, tmp_path: Path) -> None:
+    daemons = [
+        Started("writer", "--url", database_url, "--spool", str(tmp_path / f"spool{each}"), cwd=tmp_path)
+        for each in range(2)
+    ]
+    try:
+        for daemon in daemons:
+            assert daemon.stderr.readline().startswith("draining")
+        settings = Settings(flush_timeout_s=25)  # 10 s less than others need to see it by the events that wait
+        with Memory.sync(database_url, spool=tmp_path / "spool0", writer="daemon", settings=settings) as memory:
+            for stops in (False, True):
+                if stops:
+                    daemons[1].send_signal(signal.SIGSTOP)
+                for _ in range(2):  # one episode of each share
+                    with memory.recording.episode(description="an episode"):
+                        pass
+                    memory.flush()
+        assert ask(database_url, "SELECT count(*), sum(head - folded) FROM episode") == [(4, 0)]
+    finally:
+        for daemon in daemons:
+            daemon.kill()
+            daemon.communicate()
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(60, marks=pytest.mark.soak)])
