@@ -47,10 +47,11 @@ def unchanged(old: dict[str, Any]) -> dict[str, Any]:
 
 
 UPCASTERS: Final[dict[tuple[str, int], Upcaster]] = {
-    # Version 2 omits frame and orientation of a pose where they are the default, and in NodeStarted the robot's pose
-    # where its object's row has it.
+    # Version 2 omits frame and orientation of a pose where they are the default, in NodeStarted the robot's pose where
+    # its object's row has it, and in NodeEnded the content of a failure where the end of another node has it.
     **{(name, 1): unchanged for name in ("ObjectAdded", "ObjectMoved", "LocationResolved", "ObjectDetected")},
     ("NodeStarted", 1): unchanged,
+    ("NodeEnded", 1): unchanged,
 }
 """Upcasters by event type and old version."""
 

@@ -149,12 +149,24 @@ class RobotValue(_Value, frozen=True):
     name: str | None = None
 
 
+class EndReference(_Value, frozen=True):
+    """The end of a node: the sequences of its NodeStarted and of its NodeEnded."""
+
+    node: int
+    end: int
+
+
 class FailureValue(_Value, frozen=True):
-    """The exception behind a failure: qualified class, message, and those arguments that JSON can hold."""
+    """The exception behind a failure: qualified class, message, and those arguments that JSON can hold.
+
+    A failure that several nodes pass on is written once: at the others, `of` names the end that has message and
+    arguments, and the message is empty. It is None where the value has them itself.
+    """
 
     type: str
     message: str
     arguments: list[Any] = []
+    of: EndReference | None = None
 
 
 class MissingValue(_Value, frozen=True):
@@ -538,6 +550,8 @@ class NodeEnded(Happening, frozen=True):
 
     `untimed` is true if the time of the end is not known: that of the event says only when the end was reported.
     """
+
+    version = 2
 
     node: int
     status: NodeStatus

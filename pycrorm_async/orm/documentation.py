@@ -221,4 +221,6 @@ def _storage_of(column: Any) -> Storage | None:
 
 
 if __name__ == "__main__":  # `python -m pycrorm_async.orm.documentation`, after a docstring or a column has changed
+    import pycrorm_async.orm.views  # noqa: F401  maps the views, which no other module imports
+
     SCHEMA_FILE.write_bytes(msgspec.json.format(msgspec.json.encode(schema()), indent=1) + b"\n")

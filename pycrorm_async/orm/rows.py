@@ -609,6 +609,7 @@ class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
     __tablename__ = "task_tree_node"
     _unmapped: ClassVar[dict[str, dict[str, str]]] = {
         "robot_type": {"storage": "text", "after": "torso_height"},
+        "failure_node_id": {"storage": "row", "after": "failure_arguments"},
     }
 
     id: Mapped[int] = mapped_column(primary_key=True)

@@ -46,11 +46,11 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.fields import is_reserved
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, Happening, NodeStarted
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, Happening, NodeEnded, NodeStarted
 from pycrorm_async.projections.columns import OWN, Storage, column_type, physical_name
 from pycrorm_async.projections.fold import decode_events, stored_rows
 from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.projections.named_poses import NamedPoses
+from pycrorm_async.projections.named_values import NamedValues
 from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, is_missing, json_text, microseconds, row_of
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
@@ -444,7 +444,7 @@ class ProjectedBatch(ABC):
         self.reads = None if reads is None else frozenset(each.__name__ for each in reads)
         self._folds = EpisodeFolds(projection) if folds is None else folds
         self._taken: dict[int, _OpenFold] = {}
-        self._named: NamedPoses | None = None
+        self._named: NamedValues | None = None
 
     def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
         return [each for each in spans if self._folds.has(each)]
@@ -460,7 +460,7 @@ class ProjectedBatch(ABC):
                 fold.fault = self._read_again(fold, events, page.last)
 
     async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
-        """Read the poses of robots that are in the rows of objects, for a fold of single events."""
+        """Read the events that these name, for a fold of single events."""
         if self._named is not None:
             await self._named.look_up(log, events)
 
@@ -550,8 +550,8 @@ class CustomRows(ProjectedBatch):
         self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
-        if projection.reads is None or NodeStarted in projection.reads:
-            self._named = NamedPoses()
+        if projection.reads is None or not {NodeStarted, NodeEnded}.isdisjoint(projection.reads):
+            self._named = NamedValues()
 
     def add(self, fold: EpisodeFold, events: Iterable[tuple[StoredEvent, Happening]], *, kept: bool) -> Refused | None:
         """Add the changes of rows that a fold makes of events, if both databases store their values alike.
@@ -622,7 +622,7 @@ class CustomRows(ProjectedBatch):
 
     def _event(self, stored: StoredEvent, happening: Happening) -> Event:
         number, sequence, _, _, wall_ns, monotonic_ns, payload = stored
-        if isinstance(happening, NodeStarted) and self._named is not None:
+        if self._named is not None:
             happening = self._named.whole(number, happening)
         parameters: Mapping[str, Any] = {}
         dtype = declaration = None

@@ -161,6 +161,14 @@ def same_episode(one: sa.FromClause, other: sa.FromClause, condition: sa.ColumnE
     return sa.and_(condition, one.c[EPISODE] == other.c[EPISODE])
 
 
+def failure_part(tables: TablesByName, name: str) -> sa.ColumnElement[Any]:
+    """Return `failure_message` or `failure_arguments` of a node, which the row of another node may have."""
+    nodes = tables["task_tree_node"]
+    whole = nodes.alias("whole")
+    of_other = sa.select(whole.c[name]).where(same_episode(whole, nodes, whole.c.id == nodes.c.failure_node_id))
+    return sa.case((nodes.c.failure_node_id.is_(None), nodes.c[name]), else_=of_other.scalar_subquery()).label(name)
+
+
 def present(row: sa.FromClause) -> sa.ColumnElement[bool]:
     """Return the condition that an outer join has a row. From IS NOT NULL PostgreSQL would make it an inner join."""
     return sa.func.coalesce(row.c.id, 0) > 0
@@ -479,7 +487,7 @@ def root_failures(tables: TablesByName) -> sa.Select[*tuple[Any, ...]]:
         object_.label("object"),
         arm.label("arm"),
         nodes.c.reason,
-        nodes.c.failure_message.label("message"),
+        failure_part(tables, "failure_message").label("message"),
         (outcome_of(nodes) == RECOVERED).label("recovered"),
         nodes.c.start_time,
         event_of(nodes.c.id).label("sequence"),

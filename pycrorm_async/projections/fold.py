@@ -208,7 +208,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
         pose_id = robot_object if robot.pose is None else node + SLOT_ROBOT_POSE
     # Nothing below raises, so that an event adds all of its rows or none.
     rows.nodes[node] = [
-        node, number, parent, kind, dtype, "RUNNING", wall_ns // 1000, monotonic_ns, None, None, None, None, None, None,
+        node, number, parent, kind, dtype, "RUNNING", wall_ns // 1000, monotonic_ns, None, None, *NO_OUTCOME,
         pose_id, torso_height, robot_type, robot_object, robot_name, started.simulated,
     ]  # fmt: skip
     if robot is not None and robot.pose is not None:
@@ -222,22 +222,22 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
 def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
     number, sequence, _, _, _, monotonic_ns, _ = event
     node, status = row_of(number, ended.node), ended.status
-    outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else NO_OUTCOME
+    outcome = _outcome(number, ended) if ended.failure is not None or ended.result is not None else NO_OUTCOME
     if ended.has_time:
         rows.end_node(node, status, monotonic_ns, sequence, outcome)
     else:
         rows.end_node(node, status, None, None, outcome)
 
 
-def _outcome(ended: NodeEnded) -> Row:
+def _outcome(number: int, ended: NodeEnded) -> Row:
     """Return a node's columns from reason to result."""
-    failure = ended.failure
-    return (
-        reason_of(failure) if failure else None,
-        failure.message if failure else None,
-        json_text(failure.arguments) if failure and failure.arguments else None,
-        json_text(ended.result) if ended.result is not None else None,
-    )
+    failure, result = ended.failure, json_text(ended.result) if ended.result is not None else None
+    if failure is None:
+        return None, None, None, None, result
+    if failure.of is not None:
+        return reason_of(failure), None, None, row_of(number, failure.of.node), result
+    arguments = json_text(failure.arguments) if failure.arguments else None
+    return reason_of(failure), failure.message, arguments, None, result
 
 
 # --- the world ------------------------------------------------------------------------------------------------
@@ -390,8 +390,8 @@ _decode = Decoder(
 
 for _table, _columns in {
     "task_tree_node": "id process_metadata_id parent_id kind dtype status start_time start_ns end_ns end_sequence"
-    " reason failure_message failure_arguments result robot_pose_id torso_height robot_type robot_object_id robot"
-    " simulated",
+    " reason failure_message failure_arguments failure_node_id result robot_pose_id torso_height robot_type"
+    " robot_object_id robot simulated",
     "object": f"{OBJECT_COLUMNS} joints description_fingerprint color model serial mass_kg base_link",
     "episode_tagging": "id position process_metadata_id tag added time",
     "object_removal": "id process_metadata_id object_id identity_id time node_id",

@@ -80,7 +80,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.placement import PLAIN, Placement
 
-PROJECTION_VERSION = 10
+PROJECTION_VERSION = 11
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"

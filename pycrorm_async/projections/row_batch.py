@@ -41,7 +41,7 @@ _NODE_EPISODE: Final = _NODE_COLUMNS.index(EPISODE)
 _END_NS: Final = _NODE_COLUMNS.index("end_ns")
 _END_SEQUENCE: Final = _NODE_COLUMNS.index("end_sequence")
 _OUTCOME: Final = slice(_NODE_COLUMNS.index("reason"), _NODE_COLUMNS.index("result") + 1)
-NO_OUTCOME: Final[Row] = (None, None, None, None)
+NO_OUTCOME: Final[Row] = (None, None, None, None, None)
 """The columns reason to result of a node that has not failed and has no result."""
 
 
@@ -55,6 +55,7 @@ class NodeEnd(NamedTuple):
     reason: str | None
     failure_message: str | None
     failure_arguments: str | None
+    failure_node_id: int | None
     result: str | None
 
 

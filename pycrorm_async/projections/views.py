@@ -41,6 +41,7 @@ _Columns: TypeAlias = tuple[tuple[str, Storage], ...]
 _UNITED_MAX = 400
 """Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
 
+_FAILURE_PARTS = ("failure_message", "failure_arguments")
 _PICKED = "pick_up_action"
 _PLACED = "place_action"
 
@@ -225,9 +226,12 @@ def _task_tree_node(tables: Tables) -> sa.Select[Any]:
     nodes = tables["task_tree_node"]
     action_id = sa.case((nodes.c.dtype.is_not(None), nodes.c.id), else_=sa.null())
     outcome = derived_views.outcome_of(nodes).label("outcome")
-    return select(
-        *columns_in_order(nodes), *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome
+    columns = (
+        derived_views.failure_part(tables, each.key) if each.key in _FAILURE_PARTS else each
+        for each in columns_in_order(nodes)
+        if each.key != "failure_node_id"
     )
+    return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome)
 
 
 def _sequence(rows: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
@@ -252,10 +256,11 @@ def _end_and_durations(nodes: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
     return _end(nodes.c.start_time, nodes).label("end_time"), duration, duration.element.label("duration")
 
 
-def _course(nodes: sa.Table) -> tuple[sa.ColumnElement[Any], ...]:
+def _course(tables: Tables) -> tuple[sa.ColumnElement[Any], ...]:
     """Return the columns of a node's course: start and end by time and by event, robot, parent, and outcome."""
+    nodes = tables["task_tree_node"]
     times = nodes.c.start_time, *_end_and_durations(nodes)
-    ended = nodes.c.reason, nodes.c.failure_message, nodes.c.result
+    ended = nodes.c.reason, derived_views.failure_part(tables, "failure_message"), nodes.c.result
     return nodes.c.status, *times, *ended, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot, nodes.c.parent_id
 
 
@@ -274,7 +279,7 @@ def _designator(tables: Tables, unusual_lineages: tuple[tuple[str, str], ...]) -
         robot_state_id.label("robot_state_id"),
         derived_views.parameters_of(nodes).label("parameters"),
         lineage.label("lineage"),
-        *_course(nodes),
+        *_course(tables),
     ).where(nodes.c.dtype.is_not(None))
     return tables.shown(view, nodes)
 
@@ -292,7 +297,7 @@ def _of_kind(kind: str) -> Callable[[Tables], sa.Select[Any]]:
             nodes.c.id,
             nodes.c.process_metadata_id,
             nodes.c.dtype,
-            *_course(nodes),
+            *_course(tables),
             derived_views.parameters_of(nodes).label("parameters"),
         )
         return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))

@@ -166,6 +166,8 @@ class EpisodeReplay:
         self.ended: event_types.EpisodeEnded | None = None
         self.tags: tuple[str, ...] = ()
         self.nodes: dict[int, ReplayedNode] = {}
+        self._failures: dict[int, event_types.FailureValue] = {}
+        """The failures that ends have themselves, by node."""
         self.world = ReplayedWorld(strict=strict)
         self.observed: dict[str, tuple[StoredEvent, event_types.Observed]] = {}
         self.detections: deque[tuple[StoredEvent, event_types.ObjectDetected]] = deque(maxlen=LATEST_MAX)
@@ -249,7 +251,12 @@ class EpisodeReplay:
     def _end(self, at: ReplayTime, ended: event_types.NodeEnded) -> None:
         if (node := self.nodes.get(ended.node)) is None:
             raise CannotFold(f"node {ended.node} ends and never started")
-        node.status, node.failure = ended.status, ended.failure
+        failure = ended.failure
+        if failure is not None and failure.of is not None:
+            failure = self._failures.get(failure.of.node, failure)
+        elif failure is not None:
+            self._failures[ended.node] = failure
+        node.status, node.failure = ended.status, failure
         if ended.has_time:
             node.end = at
 

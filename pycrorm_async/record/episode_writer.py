@@ -17,6 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
@@ -29,6 +30,7 @@ from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import Heading, NotEncodable, encode, encoded_bytes
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
+from pycrorm_async.events.reasons import UNNAMED
 from pycrorm_async.record import values as live_values
 from pycrorm_async.record.declarations import Declared, DeclaredType
 from pycrorm_async.record.event_feed import EventFeed
@@ -263,6 +265,8 @@ class NodeEvents:
         self._simulated = simulated
         self._open: dict[int, str] = {}
         self._ending: set[int] = set()
+        self._failed: tuple[bytes, event_types.EndReference] | None = None
+        """The content of the failure that was written last, and the end that has it."""
 
     def start_root(self) -> None:
         """Write the start of the root."""
@@ -321,9 +325,25 @@ class NodeEvents:
                     for name, value in parts.items():
                         for each in live_values.missing_in(value):
                             self._emitter.missing.note(owner, name, each.missing)
-                self._put(event_types.NodeEnded(node, status, failure, result, untimed), owner)
+                if failure is None:
+                    self._put(event_types.NodeEnded(node, status, None, result, untimed), owner)
+                else:
+                    self._put_failed(event_types.NodeEnded(node, status, failure, result, untimed), failure, owner)
         finally:
             self._ending.discard(node)
+
+    def _put_failed(self, ended: event_types.NodeEnded, failure: event_types.FailureValue, owner: str) -> None:
+        """Put the end of a node that failed. The failure names the latest end that has one, if it is the same."""
+        content: bytes | None = None
+        with suppress(NotEncodable):  # `put` may cut it then; one that fills less than half of a record stays whole
+            content = encode(event_types.NodeEnded(0, "FAILED", failure), bytes_max=self._emitter.record_bytes_max // 2)
+        written = self._failed  # read once, because the garbage collector ends nodes in any thread
+        if content is not None and written is not None and written[0] == content and failure.type != UNNAMED:
+            brief = event_types.FailureValue(failure.type, "", of=written[1])
+            self._put(replace(ended, failure=brief), owner, shown={"failure": failure})
+            return
+        end = event_types.EndReference(ended.node, self._put(ended, owner))
+        self._failed = (content, end) if content is not None else None
 
     def end_all(self, status: event_types.NodeStatus, *, untimed: bool) -> None:
         """Write the ends of all open nodes but the root, the last one first; wait for ends in other threads."""

@@ -36,6 +36,7 @@ from pycrorm_async.events.types import (
     CandidateValue,
     DescriptionDeclared,
     DesignatorTypeDeclared,
+    EndReference,
     EpisodeEnded,
     FailureValue,
     FieldDeclared,
@@ -183,6 +184,8 @@ def test_the_golden_bytes_of_the_second_version_decode_to_the_documented_values(
         NodeStarted("motion", 9, "00112233445566778899aabbccddeeff", named),
         LocationResolved("CostmapLocation", offered, 0, 2, refused=refused),
         ObjectDetected("camera", seen=(SeenValue("cup", "JEROEN_CUP", PoseValue((1.0, 2.0, 0.5), upright, "map", 5)),)),
+        NodeEnded(12, "FAILED", FailureValue("plans.IKError", "too far", ["LEFT"])),
+        NodeEnded(9, "FAILED", FailureValue("plans.IKError", "", of=EndReference(12, 13))),
     ]
 
 
@@ -384,7 +387,7 @@ def test_a_shape_without_one_of_its_steps_is_refused_before_anything_is_read() -
 
 
 def test_there_is_a_step_for_every_version_that_was_ever_written() -> None:
-    second = {"ObjectAdded", "ObjectMoved", "LocationResolved", "ObjectDetected", "NodeStarted"}
+    second = {"ObjectAdded", "ObjectMoved", "LocationResolved", "ObjectDetected", "NodeStarted", "NodeEnded"}
     assert {name: kind.version for name, kind in EVENT_TYPES.items()} == {
         name: 2 if name in second else 1 for name in EVENT_TYPES
     }

@@ -141,11 +141,11 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
         "task_tree_node": [
             (
                 row(2), 1, None, "root", None, "RUNNING", time_us(2), 2_000_000_005, None, None,
-                None, None, None, None, None, None, None, None, None, False,
+                None, None, None, None, None, None, None, None, None, None, False,
             ),
             (
                 row(3), 1, row(2), "action", "NavigateAction", "RUNNING", time_us(3), 3_000_000_005, None, None,
-                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True,
+                None, None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True,
             ),
         ],
     }  # fmt: skip
@@ -161,7 +161,7 @@ def test_a_node_that_ends_in_the_batch_in_which_it_started_is_one_insert() -> No
     assert list(rows.nodes.values()) == [
         [
             row(1), 1, None, "action", "SayingAction", "FAILED", time_us(1), 1_000_000_005, 2_000_000_005,
-            2, "IKError", "no way", '["left",1]', '{"said":[1,null]}', None, None, None, None, None, False,
+            2, "IKError", "no way", '["left",1]', None, '{"said":[1,null]}', None, None, None, None, None, False,
         ]
     ]  # fmt: skip
 
@@ -171,13 +171,13 @@ def test_the_end_of_a_node_from_an_earlier_batch_is_an_update() -> None:
     script.put(NodeEnded(77, "SUCCEEDED"))
     rows = folded(script)
     assert rows.to_insert() == {}
-    assert rows.node_ends == [(row(77), "SUCCEEDED", 1_000_000_005, 1, None, None, None, None)]
+    assert rows.node_ends == [(row(77), "SUCCEEDED", 1_000_000_005, 1, None, None, None, None, None)]
 
 
 def test_a_lost_node_has_no_end_time() -> None:
     script = Script()
     script.put(NodeEnded(77, "LOST"))
-    assert folded(script).node_ends == [(row(77), "LOST", None, None, None, None, None, None)]
+    assert folded(script).node_ends == [(row(77), "LOST", None, None, None, None, None, None, None)]
 
 
 def test_a_lost_episode_makes_its_running_nodes_lost() -> None:
@@ -325,7 +325,7 @@ def test_an_event_that_cannot_be_folded_names_the_reason_and_leaves_no_row(event
     ("type_", "payload", "version", "reason"),
     [
         ("RobotDanced", b"{}", 1, "RobotDanced is not an event type of this version"),
-        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 2, "NodeEnded has version 2, this version reads 1"),
+        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 3, "NodeEnded has version 3, this version reads 2"),
         ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
     ],
 )

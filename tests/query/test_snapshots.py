@@ -468,9 +468,9 @@ async def test_an_invalid_moment_is_refused(reading: Reading, when: dict[str, An
         (
             "NodeEnded",
             b"{}",
-            2,
+            3,
             DatabaseForeign,
-            "event 16: NodeEnded has version 2, this version reads 1: use a newer",
+            "event 16: NodeEnded has version 3, this version reads 2: use a newer",
         ),
         ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event type of this version: use a newer"),
     ],

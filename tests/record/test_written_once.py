@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import weakref
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -15,7 +16,10 @@ from pycrorm_async.events.codec import declaration_of, decode, encode, fingerpri
 from pycrorm_async.events.types import (
     BriefPose,
     DesignatorTypeDeclared,
+    EndReference,
+    FailureValue,
     Happening,
+    NodeEnded,
     NodeStarted,
     ObjectReference,
     PoseReference,
@@ -23,7 +27,7 @@ from pycrorm_async.events.types import (
     RobotValue,
     with_poses,
 )
-from pycrorm_async.plan import PlanFailure
+from pycrorm_async.plan import ActionAbstract, PlanFailure
 from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable, PickUpActionPerformable
 from pycrorm_async.plan.motions import simulated_robot
 from pycrorm_async.plan.objects import ObjectDesignator
@@ -37,6 +41,7 @@ from tests.projections.event_script import Script
 from tests.record.fakes import NoteActionPerformable, RecorderCase, recorder_case
 
 ROBOT_POSE_ID = COLUMNS["task_tree_node"].index("robot_pose_id")
+FAILURE = slice(COLUMNS["task_tree_node"].index("failure_message"), COLUMNS["task_tree_node"].index("failure_node_id"))
 
 
 async def _plan() -> None:
@@ -59,7 +64,9 @@ async def _recorded() -> tuple[RecorderCase, list[Happening]]:
 
 
 def _as_first_version(case: RecorderCase, event: Happening) -> tuple[str, bytes]:
-    """Return an event as it was written before: every pose at each place, with all fields."""
+    """Return an event as it was written before: every pose and failure at each place, with all fields."""
+    if isinstance(event, NodeEnded) and event.failure is not None and event.failure.of is not None:
+        event = replace(event, failure=_failure_at(case, event.failure.of))
     if isinstance(event, NodeStarted):
         starts = {sequence: each for sequence, each in case.sink.only() if isinstance(each, NodeStarted)}
         event = replace(event, parameters=with_poses(event.parameters, lambda node: starts[node].parameters))
@@ -68,6 +75,15 @@ def _as_first_version(case: RecorderCase, event: Happening) -> tuple[str, bytes]
         pose, name = case.sink.robot_pose(episode, event), "".join(("RO", "BOT"))  # not the default itself, so written
         event = replace(event, robot=replace(event.robot, pose=pose, object_type=name))
     return type(event).__name__, encode(event)
+
+
+def _failure_at(case: RecorderCase, of: EndReference) -> FailureValue:
+    (whole,) = [each for sequence, each in case.sink.only() if sequence == of.end]
+    assert isinstance(whole, NodeEnded)
+    assert whole.node == of.node
+    assert whole.failure is not None
+    assert whole.failure.of is None
+    return whole.failure
 
 
 def _folded(case: RecorderCase, script: Script) -> dict[str, dict[Any, Row]]:
@@ -100,11 +116,15 @@ async def test_the_tables_of_poses_that_are_named_are_those_of_poses_written_at_
     assert targets == [poses_before[each[2],][1:] for each in before["move_motion"].values()]
     assert after | {"move_motion": moved} == before
     assert poses_after.items() < poses_before.items()
+    assert sum(each[FAILURE.stop] is not None for each in nodes_after.values()) == 2  # of two pick-ups
     assert nodes_after.keys() == nodes_before.keys()
     for key, node in nodes_after.items():
         former = list(nodes_before[key])
         pose, former_pose = node[ROBOT_POSE_ID], former[ROBOT_POSE_ID]
         former[ROBOT_POSE_ID] = pose
+        if (of := node[FAILURE.stop]) is not None:
+            assert node[FAILURE] == (None, None)
+            node = (*node[: FAILURE.start], *nodes_after[of,][FAILURE], None, *node[FAILURE.stop + 1 :])
         assert node == tuple(former)
         assert (pose is None) == (former_pose is None)
         if pose is not None:
@@ -232,3 +252,55 @@ def test_an_exception_whose_argument_changes_in_place_is_copied_again() -> None:
     assert copies.copy(failure, NO_REFERENCES).arguments == ["no arm reaches it", ["left"]]
     tried.append("right")
     assert copies.copy(failure, NO_REFERENCES).arguments == ["no arm reaches it", ["left", "right"]]
+
+
+@dataclass
+class PassingActionPerformable(ActionAbstract):
+    """Performs others below it; the innermost fails with its arguments."""
+
+    depth: int
+    arguments: list[Any]
+
+    async def perform(self) -> None:
+        if self.depth == 0:
+            raise PlanFailure(*self.arguments)
+        await PassingActionPerformable(self.depth - 1, self.arguments).perform()
+
+
+async def _failures_of(*attempts: tuple[Any, ...]) -> tuple[list[NodeEnded], list[NodeEnded]]:
+    """Perform three nested actions that fail for each attempt; return the ends in the log, and those observed."""
+    with recorder_case() as case, case.episode() as episode:
+        observed = case.emitter.feed.keep((NodeEnded,), 100, SYSTEM_CLOCK)
+        for arguments in attempts:
+            with suppress(PlanFailure):
+                await PassingActionPerformable(2, list(arguments)).perform()
+    ends = [replace(each, node=sequence) for sequence, each in case.sink.of(episode) if isinstance(each, NodeEnded)]
+    shown = [each.event.happening for each in observed.take()]
+    return ends, [each for each in shown if isinstance(each, NodeEnded)]
+
+
+async def test_a_failure_that_passes_nodes_is_written_once_and_observers_get_it_at_each() -> None:
+    far, near = ("too far", {"m": 2.5}), ("too near", 1)
+    ends, shown = await _failures_of(far, far, near, far)
+    written = [each.failure for each in ends if each.failure is not None]
+    kind = f"{PlanFailure.__module__}.PlanFailure"
+    contents = [None if each.of else each.arguments for each in written]
+    assert contents == [[*far], None, None, None, None, None, [*near], None, None, [*far], None, None]
+    first, third = ends[0].node, ends[6].node
+    ends_named = [each.of.end for each in written if each.of is not None]
+    assert ends_named == [first] * 5 + [third] * 2 + [ends[9].node] * 2
+    whole = [FailureValue(kind, str(given), [*given.args]) for given in (PlanFailure(*far), PlanFailure(*near))]
+    assert [each.failure for each in shown if each.failure is not None] == [whole[0]] * 6 + [whole[1]] * 3 + [
+        whole[0]
+    ] * 3
+
+
+async def test_arguments_that_only_compare_equal_are_written_again() -> None:
+    ends, _ = await _failures_of(("n", 1), ("n", True), ("n", 1.0))
+    assert [each.failure.of is None for each in ends if each.failure is not None] == [True, False, False] * 3
+
+
+async def test_a_failure_that_fills_half_a_record_is_written_at_each_node() -> None:
+    ends, _ = await _failures_of(("x", ["y" * 9_000 for _ in range(100)]))
+    failures = [each.failure for each in ends if each.failure is not None]
+    assert [each.of for each in failures] == [None] * 3

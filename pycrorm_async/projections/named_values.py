@@ -1,14 +1,15 @@
-"""Give the start of a node the poses again that the log has only in other events, which the event names.
+"""Give the start and the end of a node the values again that the log has only in other events, which they name.
 
-The tables need no pose: the id of its row follows from the event. A custom projection gets the event as it was before
-it was written. The events that a batch names are in the batch or before it; those before it are looked up in the log by
-primary key, so that a projection without a state needs none.
+A start names poses, an end the content of its failure. The tables need neither: the id of the row that has it follows
+from the event. A custom projection gets the event as it was before it was written. The events that a batch names are in
+the batch or before it; those before it are looked up in the log by primary key, so that a projection without a state
+needs none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from msgspec.structs import replace
@@ -19,7 +20,9 @@ from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-_NAMED = frozenset({"ObjectAdded", "ObjectMoved", "NodeStarted"})
+_NAMED: Final = frozenset({"ObjectAdded", "ObjectMoved", "NodeStarted"})
+"""The types of the events that may be named; also NodeEnded, if it has a failure."""
+_FAILED: Final = b'"failure":'
 
 
 class _NamedRow(msgspec.Struct):
@@ -38,10 +41,24 @@ class _Start(msgspec.Struct):
     parameters: dict[str, Any] = {}
 
 
-_start = msgspec.json.Decoder(_Start)
+class _NamedEnd(msgspec.Struct):
+    end: int
 
 
-class NamedPoses:
+class _Failure(msgspec.Struct):
+    of: _NamedEnd | None = None
+
+
+class _End(msgspec.Struct):
+    """The part of a NodeEnded that names the end of another node."""
+
+    failure: _Failure | None = None
+
+
+_start, _end = msgspec.json.Decoder(_Start), msgspec.json.Decoder(_End)
+
+
+class NamedValues:
     """The events that may be named, by episode and sequence, among those that were noted."""
 
     def __init__(self) -> None:
@@ -50,7 +67,7 @@ class NamedPoses:
     def note(self, events: Sequence[StoredEvent]) -> None:
         """Note these events."""
         for event in events:
-            if event.type in _NAMED:
+            if event.type in _NAMED or (event.type == "NodeEnded" and _FAILED in event.payload):
                 self._events[event.number, event.sequence] = event
 
     async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
@@ -60,8 +77,17 @@ class NamedPoses:
         if missing := sorted(named - self._events.keys()):
             self.note(await log.spans([Span(number, sequence - 1, sequence) for number, sequence in missing]))
 
-    def whole(self, number: int, started: event_types.NodeStarted) -> event_types.NodeStarted:
-        """Return the start of a node with the poses that it names."""
+    def whole(self, number: int, happening: event_types.Happening) -> event_types.Happening:
+        """Return the start or the end of a node with the values that it names, any other event as it is."""
+        if isinstance(happening, event_types.NodeStarted):
+            return self._with_poses(number, happening)
+        if isinstance(happening, event_types.NodeEnded) and happening.failure and happening.failure.of is not None:
+            ended = self._named(number, happening.failure.of.end)
+            if isinstance(ended, event_types.NodeEnded):
+                return replace(happening, failure=ended.failure)
+        return happening
+
+    def _with_poses(self, number: int, started: event_types.NodeStarted) -> event_types.NodeStarted:
         robot = started.robot
         if robot is not None and robot.pose is None and robot.object is not None:
             placing = self._named(number, robot.object.row)
@@ -86,12 +112,16 @@ class NamedPoses:
 
 def _named_by(event: StoredEvent) -> Iterator[int]:
     """Yield the sequences of the events that this one names."""
-    if event.type != "NodeStarted" or not (b'"robot"' in event.payload or b'"pose_of"' in event.payload):
-        return
+    started, failure = _Start(), None
     try:
-        started = _start.decode(event.payload)
+        if event.type == "NodeStarted" and (b'"robot"' in event.payload or b'"pose_of"' in event.payload):
+            started = _start.decode(event.payload)
+        elif event.type == "NodeEnded" and _FAILED in event.payload:
+            failure = _end.decode(event.payload).failure
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):  # the fold refuses the event
         return
+    if failure is not None and failure.of is not None:
+        yield failure.of.end
     robot = started.robot
     if robot is not None and robot.pose is None and robot.object is not None:
         yield robot.object.row

@@ -1,4 +1,4 @@
-"""Every reader shows the pose of a parameter that the log has in the event of a node around it."""
+"""Every reader shows the pose of a parameter and the failure of a node that the log has in the event of another one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import pytest
 import sqlalchemy as sa
 
 from pycrorm_async.events.types import (
+    EndReference,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     NodeEnded,
     NodeStarted,
     PoseReference,
@@ -17,12 +19,16 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.live.follower import Activity
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.projections.custom import Changes, Event, Projection
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import parameters_text
 from pycrorm_async.recall.cases import EpisodeCases
 from pycrorm_async.recall.columns import Case
+from pycrorm_async.report.document import episode_document
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 from tests.projections.event_script import (
@@ -144,3 +150,64 @@ def test_cases_and_the_live_page_have_the_pose() -> None:
         activity.read(event, {name: each.dtype for name, each in types.items()})
     place = parameters_text({"target": PLACE}).removeprefix("target=")
     assert activity.now == ["GoAction", f"NavigateAction target_location={place}", f"MoveMotion target={place}"]
+
+
+# --- failures -----------------------------------------------------------------------------------------------------
+
+FAR, LATE = FailureValue("plan.IKError", "too far", ["LEFT", {"m": 2.5}]), FailureValue("plan.TooLate", "5 s", [])
+
+
+def _failing() -> Script:
+    """A motion fails, and the two actions around it pass its failure on; then the root fails with another one."""
+    script = Script()
+    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(NodeStarted("root"))
+    go = script.put(NodeStarted("action", root, name_of(GO), {"place": pose(1, 2), "arm": "LEFT"}))
+    navigate = script.put(NodeStarted("action", go, name_of(NAVIGATE), {"target_location": pose(3)}))
+    motion = script.put(NodeStarted("motion", navigate, name_of(MOVE), {"target": pose(3)}))
+    end = script.put(NodeEnded(motion, "FAILED", FAR))
+    for node in (navigate, go):
+        script.put(NodeEnded(node, "FAILED", FailureValue(FAR.type, "", of=EndReference(motion, end))))
+    script.put(NodeEnded(root, "FAILED", LATE))
+    script.put(EpisodeEnded("FAILED", LATE))
+    return script
+
+
+@pytest.mark.parametrize("batch_events", [1, 100])
+async def test_views_and_moments_and_pages_have_the_failure_at_each_node(log: EventLog, batch_events: int) -> None:
+    projector = Projector(log, projections=[Ends()], batch_events=batch_events)
+    await projector.open()
+    await log.append([*declarations(GO, NAVIGATE, MOVE), *_failing().records])
+    await projector.catch_up()
+    columns = "id, reason, failure_message, failure_arguments"
+    far = "IKError", "too far", '["LEFT",{"m":2.5}]'
+    rows = [(row(2), "TooLate", "5 s", None), *((row(each), *far) for each in (3, 4, 5))]
+    assert await ask(log, f"SELECT {columns} FROM task_tree_node ORDER BY id") == rows
+    named = "SELECT id, failure_message FROM {} WHERE failure_message = 'too far' ORDER BY id"
+    assert await ask(log, named.format("action")) == [(row(3), "too far"), (row(4), "too far")]
+    assert await ask(log, named.format("designator")) == [(row(each), "too far") for each in (3, 4, 5)]
+    assert await ask(log, "SELECT id, reason, message FROM root_failure") == [(row(5), *far[:2])]
+    ends = await ask(log, "SELECT message, arguments FROM ending ORDER BY id")
+    assert ends == [far[1:]] * 3 + [("5 s", "[]")]
+    async with Reading.open_address(log.address) as reading:
+        then = await reading.as_of(1, sequence=9)
+        page = await episode_document(reading, 1, first=7)  # behind the event that has the failure
+        async with reading.session() as session:
+            nodes = (await session.scalars(sa.select(TaskTreeNode))).all()
+    assert [(node.reason, node.failure_message) for node in then.tree] == [each[1:3] for each in rows]
+    assert sorted((each.failure_message, each.failure_arguments) for each in nodes) == [
+        ("5 s", None), *[("too far", ["LEFT", {"m": 2.5}])] * 3
+    ]  # fmt: skip
+    assert "too far" in page["texts"]
+    assert (await verify(log, projections=[Ends()])).drift == 0
+
+
+class Ends(Projection):
+    name, version = "ends", 1
+    tables = {"ending": {"message": "text", "arguments": "json"}}  # noqa: RUF012 - a common form in user code
+    reads = (NodeEnded,)
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        failure = event.happening.failure if isinstance(event.happening, NodeEnded) else None
+        if failure is not None:
+            rows.insert("ending", event.id, message=failure.message, arguments=failure.arguments)
