@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 
 from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, or_, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession
-from sqlalchemy.orm import aliased
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
@@ -181,10 +180,10 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
     simulating = await _simulating_nodes(connection, rows)
     robots = await robots_of(connection, numbers)
     tags: dict[int, list[str]] = {}
-    tagged = select(orm.EpisodeTag.process_metadata_id, orm.EpisodeTag.tag).order_by(orm.EpisodeTag.tag)
-    for number, tag in await connection.execute(tagged.where(orm.EpisodeTag.process_metadata_id.in_(numbers))):
+    tag_row, node = orm.EpisodeTag.__table__.c, orm.TaskTreeNode.__table__.c
+    tagged = select(tag_row.process_metadata_id, tag_row.tag).order_by(tag_row.tag)
+    for number, tag in await connection.execute(tagged.where(tag_row.process_metadata_id.in_(numbers))):
         tags.setdefault(number, []).append(tag)
-    node = orm.TaskTreeNode
     ended_badly = frames.times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST]))
     raised = frames.times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR]) & (node.kind == "action"))
     counted = select(node.process_metadata_id, func.count(), ended_badly, raised).group_by(node.process_metadata_id)
@@ -213,7 +212,7 @@ async def _simulating_nodes(connection: AsyncConnection, episodes: Sequence[Row[
     simulated = [each for each in episodes if each.thought_by is not None]
     if not simulated:
         return {}
-    episode, node = orm.ProcessMetaData, orm.TaskTreeNode
+    episode, node = orm.ProcessMetaData.__table__.c, orm.TaskTreeNode.__table__.c
     named = select(episode.uuid, episode.id).where(episode.uuid.in_({each.thought_by for each in simulated}))
     numbers: dict[str, int] = {row[0]: row[1] for row in await connection.execute(named)}
     ids = {
@@ -241,13 +240,12 @@ async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummar
 
     Raises `UnknownEpisode`, also when several ids have these first digits.
     """
-    episode = orm.ProcessMetaData
+    episode = orm.ProcessMetaData.__table__.c
     last = select(func.max(episode.id)).where(~episode.simulated)
     number = (await connection.execute(last)).scalar() if name == "last" else None
     if number is None:
         listed = select(func.count()).where(~episode.simulated)
-        columns = episode.__table__.c
-        number = await number_named(connection, name, columns.id, columns.uuid, listed)
+        number = await number_named(connection, name, episode.id, episode.uuid, listed)
     return (await episodes(connection, number))[0]
 
 
@@ -268,13 +266,14 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
     named = select(objects.c.id, objects.c.name).where(objects.c.process_metadata_id == number)
     names = {row.id: row.name for row in await connection.execute(named)}
     simulations = await _simulations_by_node(connection, number)
-    counted = select(orm.Observation.node_id, func.count()).where(orm.Observation.process_metadata_id == number)
-    observations = dict(iter(await connection.execute(counted.group_by(orm.Observation.node_id))))
-    seen = select(orm.Detection.node_id, func.count()).where(orm.Detection.process_metadata_id == number)
-    detected = dict(iter(await connection.execute(seen.group_by(orm.Detection.node_id))))
-    sums = func.sum(orm.LocationResolution.considered), func.sum(orm.LocationResolution.offered)
-    searched = select(orm.LocationResolution.node_id, *sums).where(orm.LocationResolution.process_metadata_id == number)
-    places = {row[0]: row[1:] for row in await connection.execute(searched.group_by(orm.LocationResolution.node_id))}
+    observed, seen, search = (each.__table__.c for each in (orm.Observation, orm.Detection, orm.LocationResolution))
+
+    async def by_node(row: Any, *sums: Any) -> dict[int, Any]:
+        counted = select(row.node_id, *sums).where(row.process_metadata_id == number).group_by(row.node_id)
+        return {node: sums for node, *sums in await connection.execute(counted)}
+
+    observations, detected = await by_node(observed, func.count()), await by_node(seen, func.count())
+    places = await by_node(search, func.sum(search.considered), func.sum(search.offered))
     children: dict[int | None, list[NodeSummary]] = {}
     for row in await connection.execute(nodes_of(number)):
         parameters = with_object_names(
@@ -290,10 +289,10 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
                 thoughts=tuple(simulations.get(row.id, ())),
                 sequence=row_key(row.id).sequence,
-                observations=observations.get(row.id, 0),
+                observations=observations.get(row.id, (0,))[0],
                 considered=considered,
                 offered=offered,
-                detected=detected.get(row.id, 0),
+                detected=detected.get(row.id, (0,))[0],
                 **{name: getattr(row, name) for name in _OF_NODE},
             )
         )
@@ -302,8 +301,9 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
 
 async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
     """Return the numbers of the simulations of this episode, by the id of the node that performed them."""
-    simulating_episode, simulation = aliased(orm.ProcessMetaData), orm.ProcessMetaData
-    own = select(simulating_episode.uuid).where(simulating_episode.id == number).scalar_subquery()
+    episodes = orm.ProcessMetaData.__table__
+    simulating, simulation = episodes.alias().c, episodes.c
+    own = select(simulating.uuid).where(simulating.id == number).scalar_subquery()
     query = (
         select(simulation.id, simulation.thought_by_node)
         .where(simulation.thought_by == own, simulation.thought_by_node.is_not(None))
@@ -378,14 +378,18 @@ class EpisodeChoice:
         return "; ".join(f"{name} {value}" for name, value in conditions.items() if value is not None)
 
     def conditions(self) -> list[ColumnElement[bool]]:
-        """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status."""
-        episode, conditions = orm.ProcessMetaData, []
+        """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status.
+
+        They name columns of its table, as all that lists episodes: attributes of classes would map all classes first.
+        """
+        episode, tag_row = orm.ProcessMetaData.__table__.c, orm.EpisodeTag.__table__.c
+        conditions: list[ColumnElement[bool]] = []
         if self.status is not None:
             conditions.append(episode.status == frames.member_of(TaskStatus, self.status, "status"))
         if self.since is not None:
             conditions.append(episode.created_at >= self.since)
         tagged = {
-            each: exists().where(orm.EpisodeTag.process_metadata_id == episode.id, orm.EpisodeTag.tag == each)
+            each: exists().where(tag_row.process_metadata_id == episode.id, tag_row.tag == each)
             for each in (*self.tags, *self.without_tags)
         }
         conditions += [tagged[each] for each in self.tags]
@@ -393,25 +397,24 @@ class EpisodeChoice:
         if self.ids is not None:
             conditions.append(episode.uuid.in_(self.ids))
         if self.robot is not None:
-            robot = orm.EpisodeRobot
+            robot = orm.EpisodeRobot.__table__.c
             named = or_(robot.name == self.robot, robot.model == self.robot)
             conditions.append(exists().where(robot.process_metadata_id == episode.id, named))
         if self.text is not None:
             by_tag = exists().where(
-                orm.EpisodeTag.process_metadata_id == episode.id, frames.containing(self.text, orm.EpisodeTag.tag)
+                tag_row.process_metadata_id == episode.id, frames.containing(self.text, tag_row.tag)
             )
             conditions.append(or_(frames.containing(self.text, episode.description, episode.plan), by_tag))
         return conditions
 
     def counted(self) -> Select[*tuple[int]]:
         """Return the select of the number of episodes that fulfil the conditions, whatever the limit."""
-        return select(func.count(orm.ProcessMetaData.id)).where(*self.conditions())
+        return select(func.count(orm.ProcessMetaData.__table__.c.id)).where(*self.conditions())
 
     def newest(self) -> Select[*tuple[int]]:
         """Return the select of the numbers of the chosen episodes."""
-        return frames.limited(
-            select(orm.ProcessMetaData.id).where(*self.conditions()).order_by(orm.ProcessMetaData.id.desc()), self.limit
-        )
+        number = orm.ProcessMetaData.__table__.c.id
+        return frames.limited(select(number).where(*self.conditions()).order_by(number.desc()), self.limit)
 
 
 def episode_list(episode: Any, choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
