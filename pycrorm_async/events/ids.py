@@ -1,10 +1,13 @@
 """Ids identify episodes, events and rows.
 
 A UUID identifies an episode, (episode, sequence) an event, and (episode number, sequence, slot) a row: the slot
-distinguishes the rows of one event. A row id packs these three into 53 bits, so that data frames (float64 where a
-column is nullable) and JSON hold it exactly:
+distinguishes the rows of one event. A row id packs these three into 62 bits:
 
-    episode number 22 bits | sequence 26 bits | slot 5 bits
+    episode number 31 bits | sequence 26 bits | slot 5 bits
+
+It is an integer in tables, data frames, exported files and JSON. A reader that has doubles only, such as JavaScript,
+rounds one above 2**53, of an episode from number 4,194,304 on; so the pages identify a node by its episode's number and
+its sequence, which a double holds.
 
 The rows of a list, such as the percepts of one detection, share an id and differ in a further column. A database
 assigns the episode *number* at the first append; it is valid in that database only.
@@ -23,15 +26,18 @@ Sequence = NewType("Sequence", int)
 Position = NewType("Position", int)
 """1, 2, 3 … inside a recorder, over all its episodes."""
 RowId = NewType("RowId", int)
-"""Episode number, sequence and slot in one integer of 53 bits (see `row_id`)."""
+"""Episode number, sequence and slot in one integer of 62 bits (see `row_id`)."""
 
-EPISODE_NUMBER_MAX = 2**22 - 1
-"""Bounds the episodes of one database: the 22 bits of a row id that hold the episode number."""
+EPISODE_NUMBER_MAX = 2**31 - 1
+"""Bounds the episodes of one database: the 31 bits of a row id that hold the number, an `integer` on PostgreSQL."""
+EPISODE_NUMBER_MAX_0_1 = 2**22 - 1
+"""Bounds the episodes of a database that version 0.1.0 made, until its owner opens it for writing."""
 SEQUENCE_MAX = 2**26 - 1
 """Bounds the events of one episode: the 26 bits of a row id that hold the sequence."""
 SLOT_MAX = 2**5 - 1
 """Bounds the row ids of one event: the 5 bits of a row id that hold the slot."""
 
+_NUMBER_DIGITS = len(str(EPISODE_NUMBER_MAX))
 NUMBER_SHIFT = 31
 """The bits of a row id behind the episode's number, those of the sequence and the slot."""
 
@@ -112,6 +118,17 @@ def episode_text(episode: EpisodeId) -> str:
 def parse_episode_id(text: str) -> EpisodeId:
     """Parse the text of an episode id; the inverse of `episode_text`. Raises `ValueError` if it is not a UUID."""
     return EpisodeId(uuid.UUID(text).bytes)
+
+
+def number_in(text: str) -> EpisodeNumber | None:
+    """Return the episode number that a text is; None for one that no episode can have, or that is written otherwise.
+
+    >>> number_in("17"), number_in("017"), number_in("2147483648")
+    (17, None, None)
+    """
+    is_short = text.isdecimal() and text.isascii() and len(text) <= _NUMBER_DIGITS
+    number = int(text) if is_short else -1
+    return EpisodeNumber(number) if 0 <= number <= EPISODE_NUMBER_MAX and str(number) == text else None
 
 
 def is_episode_id(text: str) -> bool:

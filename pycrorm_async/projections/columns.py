@@ -84,6 +84,9 @@ No class maps the last two. `simulated_episode` repeats the ids of simulations, 
 rows by a lookup in a small table that consists of its key only.
 """
 
+EPISODE_KEYED: Final = ("process_metadata", "simulated_episode")
+"""The tables of which a row is an episode: their `id` is its number."""
+
 LINK_BOX = "pycrorm_link_box"
 OF_NO_EPISODE: dict[str, dict[str, Storage]] = {
     LINK_BOX: {
@@ -431,7 +434,7 @@ def _make_table(
         *(
             sa.Column(
                 stored(column),
-                sa.Text() if storage == "key" and column in _TEXT_KEYS else column_type(storage),
+                _key_type(name, column) if storage == "key" else column_type(storage),
                 nullable=storage != "key",
                 autoincrement=False,
                 key=column,
@@ -461,6 +464,13 @@ def _make_table(
             info={"dialect": "postgresql"},
         )
     return table
+
+
+def _key_type(table: str, column: str) -> TypeEngine[Any]:
+    """Return the type of a column of a key. The number of an episode is an `integer` in every table of PostgreSQL."""
+    if column in _TEXT_KEYS:
+        return sa.Text()
+    return sa.Integer() if column == "id" and table in EPISODE_KEYED else column_type("key")
 
 
 def columns_in_order(table: sa.Table) -> list[sa.Column[Any]]:

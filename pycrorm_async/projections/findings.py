@@ -13,7 +13,15 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_id_min, row_key
 from pycrorm_async.events.types import Happening
-from pycrorm_async.projections.columns import CORE, LINK_BOX, OF_NO_EPISODE, Storage, leaf_columns, make_table
+from pycrorm_async.projections.columns import (
+    CORE,
+    EPISODE_KEYED,
+    LINK_BOX,
+    OF_NO_EPISODE,
+    Storage,
+    leaf_columns,
+    make_table,
+)
 from pycrorm_async.projections.generations import Generation
 from pycrorm_async.projections.row_batch import Row
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
@@ -21,8 +29,6 @@ from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 # === row comparison ===========================================================================================
 #
 # Compare the rows that the fold makes with the rows in the tables, for some whole episodes at a time.
-
-_EPISODE_KEYED = ("process_metadata", "simulated_episode")
 
 
 class TableDifference(NamedTuple):
@@ -70,8 +76,8 @@ class EpisodeRange(NamedTuple):
 
     @property
     def limits(self) -> dict[str, int]:
-        """The parameters `first` and `end` of a query."""
-        return {"first": self.first, "end": EPISODE_NUMBER_MAX + 1 if self.end is None else self.end}
+        """The parameters `first` and `last` of a query."""
+        return {"first": self.first, "last": EPISODE_NUMBER_MAX if self.end is None else self.end - 1}
 
 
 class Comparison:
@@ -119,10 +125,10 @@ class Comparison:
         first, end = episodes
         row_range = row_id_min(first), None if end is None else row_id_min(end)
         for name, table in self._tables.items():
-            low, high = (first, end) if name in _EPISODE_KEYED else row_range
+            low, high = (first, end) if name in EPISODE_KEYED else row_range
             key = next(iter(table.primary_key.columns))
             # The first range also has the rows of numbers below 0, which no episode has.
-            where = [*([key >= low] if first else []), *([key < high] if high is not None else [])]
+            where = [*([key >= low] if first else []), *([key <= high - 1] if high is not None else [])]
             stored = await _rows(connection, table, *where)
             self.count += len(stored)
             differences += _compared(name, [*table.columns.keys()], _by_key(table, folded.pop(name, ())), stored)
@@ -177,7 +183,7 @@ def _compared(
         stored, expected = stored_rows.get(key), folded_rows.get(key)
         if stored == expected:
             continue
-        number, sequence = (key[0], 1) if name in _EPISODE_KEYED else _event_of(key[0])
+        number, sequence = (key[0], 1) if name in EPISODE_KEYED else _event_of(key[0])
         if stored is None or expected is None:
             yield TableDifference(number, sequence, name, None, stored, expected)
             continue

@@ -12,7 +12,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, LogDamaged, TablesOutdated
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
-from pycrorm_async.events.ids import row_key
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, Happening, ObjectAdded, references_in
 from pycrorm_async.projections import custom, custom_tables, findings, fold, pipeline
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 
 _KEPT = text("""
 SELECT episode, sequence, digest FROM pycrorm_digest
-WHERE episode >= :first AND episode < :end ORDER BY episode, sequence""")
+WHERE episode BETWEEN :first AND :last ORDER BY episode, sequence""")
 _WITHOUT_EPISODE = text("""
 SELECT DISTINCT episode FROM pycrorm_digest
-WHERE episode >= :first AND episode < :end AND episode NOT IN (SELECT number FROM episode) ORDER BY episode""")
+WHERE episode BETWEEN :first AND :last AND episode NOT IN (SELECT number FROM episode) ORDER BY episode""")
 _EVENTS_BEYOND = text("""
 SELECT episode, head, max(sequence) FROM pycrorm_digest JOIN episode ON number = episode
-WHERE episode >= :first AND episode < :end AND sequence > head GROUP BY episode, head ORDER BY episode""")
+WHERE episode BETWEEN :first AND :last AND sequence > head GROUP BY episode, head ORDER BY episode""")
 _AT = text("SELECT digest FROM pycrorm_digest WHERE episode = :number AND sequence = :sequence")
 
 
@@ -335,12 +335,12 @@ _FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")
 _DESCRIPTIONS = text(f"{_BY_PREFIX} = '{DESCRIPTION_PREFIX}'")
 _DESCRIPTIONS_READ = 100
 """Bounds the descriptions read at once: each takes up to `record_bytes_max`."""
-_TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first AND number < :end")
+_TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number BETWEEN :first AND :last")
 # Looks up the index once for each gap between two episodes, because reading every event would take minutes.
 _GAPS = text("""
 SELECT number, following FROM (
     SELECT number, lead(number, 1, CAST(:end AS BIGINT)) OVER (ORDER BY number) AS following
-    FROM (SELECT number FROM episode UNION ALL SELECT :first) AS known
+    FROM (SELECT number FROM episode UNION ALL SELECT CAST(:first AS BIGINT)) AS known
 ) AS gap WHERE following > number + 1
 AND EXISTS (SELECT 1 FROM event WHERE episode > number AND episode < following) ORDER BY number""")
 _FIRST_IN_GAP = text(
@@ -351,7 +351,7 @@ _BEYOND = text("""
 SELECT number, head, first, last FROM (
     SELECT number, head, (SELECT min(sequence) FROM event WHERE episode = number) AS first,
         (SELECT max(sequence) FROM event WHERE episode = number) AS last
-    FROM episode WHERE number >= :first AND number < :end
+    FROM episode WHERE number BETWEEN :first AND :last
 ) AS each_episode WHERE first < 1 OR last > head ORDER BY number""")
 
 
@@ -405,7 +405,7 @@ async def _check_part(
     missing = ""
     for _ in range(_ATTEMPTS):
         async with log.snapshot() as connection:
-            limits = {"first": within.first, "last": within.limits["end"] - 1, "limit": _PART_EVENTS}
+            limits = {**within.limits, "limit": _PART_EVENTS}
             episodes = await dialect_of(connection).rows(
                 connection, stored.EpisodeRow, schema.SELECT_EPISODES, **limits
             )
@@ -439,7 +439,7 @@ def _first_part(
         events += row.head
         if place and events > _PART_EVENTS:
             return episodes[:place], within._replace(first=row.number)
-    if len(episodes) < _PART_EVENTS:
+    if len(episodes) < _PART_EVENTS or episodes[-1].number == EPISODE_NUMBER_MAX:
         return episodes, None
     return episodes, within._replace(first=episodes[-1].number + 1)
 
@@ -721,7 +721,7 @@ class ProjectionCheck:
         place = pipeline.place_of(generation.number, name)
         if not await dialect.keep(connection, [*comparison.tables, place]):
             return False
-        clauses = "WHERE id >= :first AND id < :end"
+        clauses = "WHERE id BETWEEN :first AND :last"
         checkpoints = await connection.execute(text(f"SELECT id, folded FROM {place} {clauses}"), part.limits)  # noqa: S608
         self._folded = {each.id: each.folded for each in checkpoints}
         learn = custom_tables.learner_of(self._projection)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, Union
 from sqlalchemy import CompoundSelect, Dialect, Row, Select, func, select
 
 from pycrorm_async.errors import CallerError, InternalError, QueryRefused, UnknownEpisode
+from pycrorm_async.events.ids import number_in
 from pycrorm_async.orm import DesignatorType, Detection, EpisodeRobot, EpisodeTag, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.query.frames import EpisodeNumber, is_named
@@ -33,8 +34,6 @@ FrameQuery: TypeAlias = (
     "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question | SyncQuestion"
 )
 """A query that has a frame: a select, a union of selects, a mapped class, whose rows are all meant, or a question."""
-_DIGITS_MAX = 7
-"""The largest number of an episode has seven digits."""
 _DIGITS_OF_ID = 4
 """Fewer digits are a number and not the first ones of an id, as in `store.log`."""
 
@@ -216,17 +215,17 @@ def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
     name, numbered = episode_name(episode), ProcessMetaData
     if name == "last":
         return select(func.max(numbered.id)).where(~numbered.simulated).scalar_subquery()
-    is_number = name.isdecimal() and name.isascii() and len(name) <= _DIGITS_MAX
-    if is_number and (isinstance(episode, int) or len(name) < _DIGITS_OF_ID) and name == str(int(name)):
-        return int(name)
+    number = number_in(name)
+    if number is not None and (isinstance(episode, int) or len(name) < _DIGITS_OF_ID):
+        return number
     if len(name) < _DIGITS_OF_ID:
         raise UnknownEpisode(f"there is no episode {name!r}; `pycrorm episodes` lists all")
     is_named = numbered.uuid.startswith(name.lower(), autoescape=True)
     # Without HAVING, SQLite would take the first of several episodes, and PostgreSQL refuse the select.
     begins = select(func.min(numbered.id)).where(is_named).having(func.count() == 1).scalar_subquery()
-    if not is_number or name.startswith("0"):
+    if number is None:
         return begins
-    return func.coalesce(select(numbered.id).where(numbered.id == int(name)).scalar_subquery(), begins)
+    return func.coalesce(select(numbered.id).where(numbered.id == number).scalar_subquery(), begins)
 
 
 # === ports ====================================================================================================

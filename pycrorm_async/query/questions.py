@@ -574,7 +574,9 @@ class Ask(Generic[Q]):
             # to join them; with each range it expects a two-hundredth of that, and looks the steps up by their ids.
             .where(
                 latest.c.steps_before.between(sa.literal_column("1"), sa.literal_column(str(count))),
-                latest.c.node_id.between(_first_id(latest.c.episode), _first_id(latest.c.episode + 1)),
+                latest.c.node_id.between(
+                    _first_id(latest.c.episode), _first_id(latest.c.episode) + sa.literal_column(str(1 << _NUMBER_BITS))
+                ),
             )
             .order_by(latest.c.failure_id, latest.c.steps_before)
         )

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
+from pycrorm_async.events.ids import SEQUENCE_MAX, row_id_min
 from pycrorm_async.query.frames import TRIED
 from pycrorm_async.query.notebook_html import cases_html
 from pycrorm_async.query.snapshot import Moment
@@ -569,7 +569,7 @@ class Sequences:
 
     def related(self, case: Case, wanted: Relation) -> list[Case]:
         """Return the other cases of its episode that lie in this relation to it, as in "they happened during it"."""
-        ends = np.searchsorted(self._nodes, [row_id(case.episode, 0, 0), row_id(case.episode + 1, 0, 0)])
+        ends = np.searchsorted(self._nodes, [row_id_min(case.episode), row_id_min(case.episode + 1)])
         others = (self._case(int(index)) for index in self._by_node[ends[0] : ends[1]])
         related = [each for each in others if each.node != case.node and relation(each, case) is wanted]
         return sorted(related, key=lambda each: (each.started_us, each.node))

@@ -26,7 +26,7 @@ from sqlalchemy import Select, select
 
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_NODE, row_id, row_key
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, SLOT_NODE, row_id, row_id_min, row_key
 from pycrorm_async.events.types import DesignatorTypeDeclared, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import Designator
@@ -623,7 +623,7 @@ def case_of(case: AnyCase, library: CaseLibrary) -> Case:
     case = node_of(case)
     stored = library.find(case)
     if stored is None:
-        key = row_key(case) if 0 < case < 2**53 else None
+        key = row_key(case) if 0 < case < row_id_min(EPISODE_NUMBER_MAX + 1) else None
         place = f"event {key.sequence} of episode {key.number}" if key is not None else f"{case}"
         raise errors.CallerError(f"there is no case of {place}: it does not exist, is not an action, or has not ended")
     return stored

@@ -37,7 +37,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DamageError, InternalError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialect import DECLARATIONS, Dialect, Insertion, RowRefused
@@ -439,12 +439,12 @@ class Appending:
                 now_ns = SYSTEM_CLOCK.wall_ns()
                 await self._dialect.execute(connection, schema.UPDATE_RESTORED, restored=removed.id, now_ns=now_ns)
         numbers = restored | (await self._assign_numbers(connection, missing) if missing else {})
+        most = EPISODE_NUMBER_MAX
+        if max(numbers.values(), default=0) > EPISODE_NUMBER_MAX_0_1:
+            most = await self._dialect.number_max(connection)
         for each, number in numbers.items():
-            if number > EPISODE_NUMBER_MAX:
-                refusals[each] = (
-                    f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
-                    " move its spool to a new memory with `pycrorm spool rebind`"
-                )
+            if number > most:
+                refusals[each] = f"all {most:,} episode numbers of this memory are used: {_room(most, _MOVE)}"
             else:
                 started_ns = self._batch.episodes[each][0].wall_ns
                 rows[each] = EpisodeRow(number, episode_text(each), head=0, folded=0, started_wall_ns=started_ns)
@@ -531,35 +531,38 @@ async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequenc
 #
 # Warn before an episode or a memory has used up its numbers.
 #
-# Row ids have 53 bits: 22 for the episode's number, 26 for the event's sequence. Both limits are distant (a thousand
-# episodes a day for eleven years, a week of a hundred events a second). From nine tenths of a limit on, `status` warns
-# and the process that stores the events logs one line, so that a user has time to act.
+# Row ids have 31 bits for the episode's number and 26 for the event's sequence. Both limits are distant (a thousand
+# robots with an episode a minute for four years, a week of a hundred events a second). From nine tenths of a limit on,
+# `status` warns and the process that stores the events logs one line, so that a user has time to act.
 
 EPISODES_MANY = EPISODE_NUMBER_MAX * 9 // 10 + 1
-"""Episode number from which a memory counts as nearly full: 3,774,873, nine tenths of the limit."""
+"""Episode number from which a memory counts as nearly full: 1,932,735,283, nine tenths of the limit."""
+_MOVE = "move its spool to a new memory with `pycrorm spool rebind`"
 
 EVENTS_MANY = SEQUENCE_MAX * 9 // 10 + 1
 """Sequence from which an episode counts as nearly full: 60,397,977, nine tenths of the limit."""
 
 
-def number_warning(number: int) -> str | None:
-    """Return the warning for a memory's latest episode number; None below nine tenths.
+def number_warning(number: int, most: int = EPISODE_NUMBER_MAX) -> str | None:
+    """Return the warning for a memory's latest episode number, of at most `most`; None below nine tenths.
 
-    >>> number_warning(4_000_000)
-    '4,000,000 of 4,194,303 episode numbers are used (95 %): record into a new database before none is left'
+    >>> number_warning(2_000_000_000)
+    '2,000,000,000 of 2,147,483,647 episode numbers are used (93 %): record into a new database before none is left'
     """
-    if number < EPISODES_MANY:
+    if number <= most * 9 // 10:
         return None
-    if number >= EPISODE_NUMBER_MAX:
-        return (
-            f"all {EPISODE_NUMBER_MAX:,} episode numbers are used: new episodes are kept in the spool until it belongs"
-            " to a new database"
-        )
-    share = number * 100 // EPISODE_NUMBER_MAX
-    return (
-        f"{number:,} of {EPISODE_NUMBER_MAX:,} episode numbers are used ({share} %): record into a new database before"
-        " none is left"
-    )
+    if number >= most:
+        kept = "new episodes are kept in the spool until it belongs to a new database"
+        return f"all {most:,} episode numbers are used: {_room(most, kept)}"
+    used = f"{number:,} of {most:,} episode numbers are used ({number * 100 // most} %)"
+    return f"{used}: {_room(most, 'record into a new database before none is left')}"
+
+
+def _room(most: int, advice: str) -> str:
+    """Return the advice for a memory without numbers; a login that owns the log gets more of one of version 0.1.0."""
+    if most == EPISODE_NUMBER_MAX:
+        return advice
+    return f"the login that owns the log makes room for {EPISODE_NUMBER_MAX:,} with `pycrorm writer --once`"
 
 
 def events_warning(episode: EpisodeRow) -> str | None:

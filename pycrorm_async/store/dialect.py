@@ -20,6 +20,7 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import Record
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1
 from pycrorm_async.store import schema
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import RemovedEpisode, Span, StoredEvent
@@ -94,6 +95,9 @@ class Dialect(ABC):
         log_schema: the schema of the log's tables.
         episode_id: SQL that reads an id from the table `episode`, as valid text even where it is damaged.
         select_declarations: the query of the designator types' payloads, in the order of arrival.
+        has_former_numbers: the query of whether the table `episode` refuses numbers above those of version 0.1.0, and
+            whether this login may change that.
+        permit_numbers: the statements that change it.
         begin_snapshot: the statement that makes a transaction that begins a snapshot, where it is none by itself.
         place: the statements that create the schema of the tables made from the log, where there are schemas.
         faults: the exceptions of the driver, and those SQLAlchemy raises for it.
@@ -103,6 +107,8 @@ class Dialect(ABC):
     log_schema: ClassVar[str | None] = None
     episode_id: ClassVar[str]
     select_declarations: ClassVar[Select[Any]]
+    has_former_numbers: ClassVar[str]
+    permit_numbers: ClassVar[Sequence[str]]
     begin_snapshot: ClassVar[str | None] = None
     place: ClassVar[Sequence[str]] = ()
     faults: ClassVar[tuple[type[Exception], ...]]
@@ -242,6 +248,16 @@ class Dialect(ABC):
     @abstractmethod
     async def table_state(self, connection: AsyncConnection, table: Table) -> TableState:
         """Return the state of a table of the log."""
+
+    async def number_max(self, connection: AsyncConnection, *, permit: bool = False) -> int:
+        """Return the highest number that an episode can get; `permit` first changes a log of version 0.1.0.
+
+        Programs of that version still use such a log, and refuse new episodes when they have used its numbers.
+        """
+        is_former, is_owner = tuple((await connection.exec_driver_sql(self.has_former_numbers)).one())
+        if is_former and is_owner and permit:
+            await self.execute_all(connection, self.permit_numbers)
+        return EPISODE_NUMBER_MAX_0_1 if is_former and not (is_owner and permit) else EPISODE_NUMBER_MAX
 
     @abstractmethod
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:

@@ -28,7 +28,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, is_episode_id
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, is_episode_id, number_in
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store import schema
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
@@ -357,8 +357,10 @@ class EventLog:
     async def limits_near(self) -> list[str]:
         """Return a warning for each limit of numbers that the memory, or an episode that has not ended, comes near."""
         last = await self.last_number()
+        async with self.reading() as connection:
+            most = await self._dialect.number_max(connection)
         episodes = await self.read(EpisodeRow, schema.SELECT_LONG, events_min=EVENTS_MANY)
-        return [each for each in (number_warning(last), *map(events_warning, episodes)) if each is not None]
+        return [each for each in (number_warning(last, most), *map(events_warning, episodes)) if each is not None]
 
     async def declarations(self) -> list[bytes]:
         """Read the payloads of all DesignatorTypeDeclared, in the order of first arrival."""
@@ -479,6 +481,7 @@ async def _make_or_migrate(
         if (await dialect.table_state(connection, schema.DIGEST)).creatable:
             placed = await dialect.placement(connection)
             await dialect.execute_all(connection, dialect.definition(schema.DIGEST, placed, if_missing=True))
+        await dialect.number_max(connection, permit=True)
         format_now = len(dialect.migrations)
         if identity is None:
             identity = LogIdentity(str(uuid.uuid4()), format_now)
@@ -558,8 +561,6 @@ def _missing_log(log_id: str) -> str:
 # `last` is the newest episode that is not a simulation. The lookup in the log works without tables. It costs the same
 # however many episodes there are.
 
-_DIGITS_MAX = 7
-"""The largest number of an episode has seven digits."""
 _DIGITS_OF_ID = 4
 """Fewer digits are a number and not the first ones of an id."""
 _LOOKED_AT = 100
@@ -578,11 +579,11 @@ async def number_named(
     """
     meant = {"number": 0, "first": "", "last": ""}
     # Four digits may be a number, or the beginning of an id without a letter: the number wins.
-    if name.isdecimal() and name.isascii() and len(name) <= _DIGITS_MAX and str(int(name)) == name:
-        number = (await connection.execute(select(numbers).where(numbers == int(name)))).scalar()
+    if (meant_number := number_in(name)) is not None:
+        number = (await connection.execute(select(numbers).where(numbers == meant_number))).scalar()
         if number is not None:
             return int(number)
-        meant["number"] = int(name)
+        meant["number"] = meant_number
     # Between two whole ids, because no order of texts then depends on where their hyphens are.
     first, last = (name.lower() + end[len(name) :] for end in (_NO_ID, _LAST_ID))
     if len(name) >= _DIGITS_OF_ID and is_episode_id(first):

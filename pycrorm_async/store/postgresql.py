@@ -190,6 +190,16 @@ coalesce(pg_catalog.has_table_privilege(relation, 'SELECT')
     AND pg_catalog.has_table_privilege(relation, 'INSERT'), false)
 FROM (SELECT pg_catalog.to_regclass($1::text)::oid) AS named (relation)"""
 
+HAS_FORMER_NUMBERS = f"""
+SELECT EXISTS (
+    SELECT FROM pg_catalog.pg_constraint WHERE conrelid = pg_class.oid AND conname = 'episode_number_check'
+    AND pg_catalog.strpos(pg_catalog.pg_get_constraintdef(oid), '{ids.EPISODE_NUMBER_MAX_0_1}') > 0
+), pg_catalog.pg_has_role(relowner, 'USAGE')
+FROM pg_catalog.pg_class WHERE pg_class.oid = pg_catalog.to_regclass('{LOG}.episode')::oid"""
+PERMIT_NUMBERS = f"""
+ALTER TABLE {LOG}.episode DROP CONSTRAINT episode_number_check,
+ADD CONSTRAINT episode_number_check CHECK (number BETWEEN 1 AND {ids.EPISODE_NUMBER_MAX})"""
+
 NEW_NUMBERS = f"SELECT pg_catalog.nextval('{LOG}.episode_number') FROM pg_catalog.generate_series(1, $1::int)"
 SKIP_NUMBERS = f"""
 SELECT pg_catalog.max(pg_catalog.nextval('{LOG}.episode_number')) FROM pg_catalog.generate_series(1, $1::int)"""
@@ -252,6 +262,8 @@ class PostgreSQL(dialect.Dialect):
     select_declarations: ClassVar[Select[Any]] = schema.select_declarations(
         "pg_catalog.substr(fingerprint, 1, 5) <> 'urdf-'"
     )
+    has_former_numbers = HAS_FORMER_NUMBERS
+    permit_numbers = (PERMIT_NUMBERS,)
     begin_snapshot = "SET TRANSACTION ISOLATION LEVEL REPEATABLE READ"
     place = (f"CREATE SCHEMA IF NOT EXISTS {TABLES}",)
     faults = postgresql_errors.FAULTS

@@ -65,7 +65,7 @@ _within_head = sql.CheckConstraint("folded BETWEEN 0 AND head")
 EPISODE: Final = _table(
     "episode",
     "episode",
-    _key("number", _Long, sql.CheckConstraint(f"number BETWEEN 1 AND {EPISODE_NUMBER_MAX}")),
+    _key("number", sql.Integer, sql.CheckConstraint(f"number BETWEEN 1 AND {EPISODE_NUMBER_MAX}")),
     sql.Column("id", sql.Text, nullable=False, unique=True),
     sql.Column("head", _Long, sql.CheckConstraint(f"head BETWEEN 0 AND {SEQUENCE_MAX}"), nullable=False),
     sql.Column("folded", _Long, _within_head, nullable=False, server_default=sql.text("0")),
@@ -84,10 +84,10 @@ _IS_STOPPED: Final = sql.or_(EPISODE.c.refused.is_not(None), EPISODE.c.parked.is
 sql.Index("episode_behind", EPISODE.c.number, info={WHERE: _IS_BEHIND})
 sql.Index("episode_stopped", EPISODE.c.number, info={WHERE: _IS_STOPPED})
 
-# `Integer` holds both parts of the key (`events.ids`), on PostgreSQL in half the bytes of a bigint, which the logs of
-# 0.1.0 have and which reads alike. The payload is text, which keeps the bytes of the queue: jsonb refuses U+0000,
-# reorders keys and rounds numbers. SQLite's table has a rowid, because the rows are too long for WITHOUT ROWID, which
-# appended a third slower.
+# `Integer` holds every part of a key (`events.ids`), on PostgreSQL in half the bytes of a bigint, which earlier logs
+# have and which reads alike. The payload is text, which keeps the bytes of the queue: jsonb refuses U+0000, reorders
+# keys and rounds numbers. SQLite's table has a rowid, because the rows are too long for WITHOUT ROWID, which appended a
+# third slower.
 EVENT: Final = _table(
     "event",
     "event",
@@ -127,7 +127,7 @@ BLOB: Final = _table(
 REMOVED: Final = sql.Table(
     "pycrorm_removed_episode",
     METADATA,
-    _key("number", _Long),
+    _key("number", sql.Integer),
     sql.Column("id", sql.Text, nullable=False, unique=True),
     *_required(head=_Long, started_wall_ns=_Long),
     sql.Column("ended_wall_ns", _Long),
@@ -307,12 +307,12 @@ SELECT_IDS: Final = select(EPISODE.c.number, _ValidId().label("id")).where(_is_n
 SELECT_NUMBER_MAX: Final = select(func.coalesce(func.max(EPISODE.c.number), sql.literal_column("0")))
 
 _rows = _batch(
-    "rows", number=_Long, id=sql.Text, head=_Long, started_wall_ns=_Long, ended_wall_ns=_Long, refused=sql.Text
+    "rows", number=sql.Integer, id=sql.Text, head=_Long, started_wall_ns=_Long, ended_wall_ns=_Long, refused=sql.Text
 )
 UPSERT_EPISODES: Final = _insert_batch(EPISODE, _rows).ext(
     _OnConflict("number", updated=("head", "ended_wall_ns", "refused"))
 )
-_steps = _batch("steps", number=_Long, before=_Long, folded=_Long)
+_steps = _batch("steps", number=sql.Integer, before=_Long, folded=_Long)
 # Locked by number, as elsewhere: an UPDATE alone locks in any order, and two folds of the same episodes could deadlock.
 _taken = (
     select(_steps)

@@ -28,6 +28,7 @@ from pycrorm_async import core
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.events.codec import Record
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1
 from pycrorm_async.store import dialect, schema, sqlite_engine
 from pycrorm_async.store.dialect import MADE
 from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, StoppableConnection, claim
@@ -37,6 +38,7 @@ _COUNT_TABLES: Final = (
     "SELECT count(*), total(name = 'pycrorm_log') FROM sqlite_master"
     " WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
 )
+_CHECK: Final = "number BETWEEN 1 AND "
 _COLUMNS: Final = """
 SELECT t.name, c.name FROM sqlite_master AS t JOIN pragma_table_info(t.name) AS c WHERE t.type = 'table'"""
 # Ordered by the primary key, the only usable index. Selects sequence to monotonic_ns and the payload's length.
@@ -54,6 +56,19 @@ class SQLite(dialect.Dialect):
     # The prefix of a description's fingerprint is behind the hexadecimal digits, so the index on fingerprints leads to
     # the designator types alone, however many descriptions there are.
     select_declarations: ClassVar[Select[Any]] = schema.select_declarations("fingerprint < 'g'")
+    has_former_numbers = (
+        f"SELECT instr(sql, '{_CHECK}{EPISODE_NUMBER_MAX_0_1})'), 1 FROM sqlite_master"
+        " WHERE type = 'table' AND name = 'episode'"
+    )
+    # A CHECK can only be changed in the text of the table. Making a view shows other connections that it has changed.
+    permit_numbers = (
+        "PRAGMA writable_schema = ON",
+        f"""UPDATE sqlite_master SET sql = replace(sql, '{_CHECK}{EPISODE_NUMBER_MAX_0_1})',
+            '{_CHECK}{EPISODE_NUMBER_MAX})') WHERE type = 'table' AND name = 'episode'""",
+        "PRAGMA writable_schema = RESET",
+        "CREATE VIEW pycrorm_changed AS SELECT 1",
+        "DROP VIEW pycrorm_changed",
+    )
     faults = (DBAPIError, sqlite3.Error, UnicodeDecodeError)  # UnicodeDecodeError: a name in a damaged file
 
     # --- the log --------------------------------------------------------------------------------------------------

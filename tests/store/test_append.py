@@ -392,7 +392,7 @@ async def test_an_episode_number_beyond_the_last_is_refused_and_nothing_else_is(
         ask_to_change(database_url, f"SELECT setval('pycrorm.episode_number', {EPISODE_NUMBER_MAX})")
     refused = await log.append([*run_of(episode(2), 1, 2), *run_of(episode(1), 2, 3)])
     assert refused == {
-        episode(2): "all 4,194,303 episode numbers of this memory are used:"
+        episode(2): "all 2,147,483,647 episode numbers of this memory are used:"
         " move its spool to a new memory with `pycrorm spool rebind`"
     }
     assert ask(database_url, "SELECT head FROM episode WHERE number = 1") == [(3,)]

@@ -96,7 +96,7 @@ async def test_a_memory_and_an_open_episode_near_their_limits_are_named(log: Eve
     await log.store([record(episode(3), 1)], numbers={episode(3): EPISODES_MANY})
     ask_to_change(database_url, f"UPDATE episode SET head = {EVENTS_MANY} WHERE number = 1")
     numbers, events = await log.limits_near()
-    assert numbers.startswith("3,774,873 of 4,194,303 episode numbers are used")
+    assert numbers.startswith("1,932,735,283 of 2,147,483,647 episode numbers are used")
     assert events.startswith("episode 1 (")
 
 

@@ -13,11 +13,12 @@ import pytest
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
+from pycrorm_async.events.ids import episode_text
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.schema import DIGEST, FORMAT_1
-from tests.databases import Server, ask, ask_to_change
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, run_of
 
@@ -103,6 +104,51 @@ async def test_a_migration_that_fails_leaves_the_log_as_it_was(
             await opened(address)
     assert catalogue_of(database_url) == before
     assert ask(database_url, "SELECT format FROM pycrorm_log") == [(1,)]
+
+
+FORMER = "number BETWEEN 1 AND 4194303"
+FORMER_NUMBERS = {
+    True: (
+        "PRAGMA writable_schema = ON",
+        f"UPDATE sqlite_master SET sql = replace(sql, 'number BETWEEN 1 AND 2147483647', '{FORMER}')",
+        "CREATE VIEW changed AS SELECT 1",
+        "DROP VIEW changed",
+    ),
+    False: (
+        "ALTER TABLE pycrorm.episode DROP CONSTRAINT episode_number_check",
+        f"ALTER TABLE pycrorm.episode ADD CONSTRAINT episode_number_check CHECK ({FORMER})",
+    ),
+}
+"""The statements that give a log the numbers of version 0.1.0, on SQLite and on PostgreSQL."""
+
+
+async def test_a_log_of_version_0_1_0_is_read_as_it_is_and_gets_all_numbers_when_its_owner_writes(
+    address: DatabaseAddress, database_url: str
+) -> None:
+    log = await EventLog.open(address, create=True)
+    await log.append(run_of(episode(1), 1, 3))
+    catalogue = catalogue_of(database_url)
+    change_each(database_url, FORMER_NUMBERS[address.is_sqlite])
+    assert catalogue_of(database_url) != catalogue
+    last = f"(4194303, '{episode_text(episode(2))}', 0, 0)"
+    ask_to_change(database_url, f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES {last}")
+    if not address.is_sqlite:
+        ask_to_change(database_url, "SELECT setval('pycrorm.episode_number', 4194303)")
+    refused = await log.append(run_of(episode(3), 1, 1))  # as by a login that does not own the log
+    room = "the login that owns the log makes room for 2,147,483,647 with `pycrorm writer --once`"
+    assert refused == {episode(3): f"all 4,194,303 episode numbers of this memory are used: {room}"}
+    await log.close()
+    log = await EventLog.open(address, create=False)
+    assert await log.limits_near() == [f"all 4,194,303 episode numbers are used: {room}"]
+    assert [each.number for each in await log.episodes()] == [1, 4_194_303]
+    await log.close()
+    log = await EventLog.open(address, create=True)
+    assert await log.append(run_of(episode(3), 1, 1)) == {}
+    assert await log.limits_near() == []
+    await log.close()
+    rows = ask(database_url, "SELECT number FROM episode ORDER BY number DESC")
+    assert rows[0][0] > 4_194_303
+    assert catalogue_of(database_url) == catalogue
 
 
 @pytest.mark.parametrize("create", [True, False])
