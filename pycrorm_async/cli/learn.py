@@ -32,7 +32,8 @@ from pycrorm_async.learning.experiment import (
     pick_up_in_kitchen,
     study,
 )
-from pycrorm_async.learning.policy import default_policy, draw_policies, name_of, save_policy
+from pycrorm_async.learning.policy import default_policy, draw_policies
+from pycrorm_async.learning.policy_file import name_of, save_policy
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scenes import Scene

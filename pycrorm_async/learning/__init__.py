@@ -4,7 +4,15 @@
 >>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()
 """
 
-from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp, RecalledPickUp, RecalledPickUpPerformable
+from pycrorm_async.learning.features import Edge, PickUpContext
+from pycrorm_async.learning.move_and_pick_up import (
+    MoveAndPickUp,
+    PredictedPickUpPerformable,
+    RecalledPickUp,
+    RecalledPickUpPerformable,
+    context_of,
+)
+from pycrorm_async.learning.polar_policy import PolarPolicy
 from pycrorm_async.learning.policy import (
     Evidence,
     PickUpChoice,
@@ -13,23 +21,29 @@ from pycrorm_async.learning.policy import (
     Region,
     default_policy,
     draw_policies,
-    load_policy,
-    name_of,
-    save_policy,
 )
+from pycrorm_async.learning.policy_file import load_policy, name_of, save_policy
 from pycrorm_async.learning.recorded_policy import read_policy, record_policy
 from pycrorm_async.learning.rollouts import Tally, batch_rollout, rollouts_question
 from pycrorm_async.learning.scenes import Disturbance, Scene, Stage
+from pycrorm_async.learning.success_model import Draws, SuccessModel
 from pycrorm_async.learning.tree import learn
 
 __all__ = [
     "MoveAndPickUp",
     "RecalledPickUp",
     "RecalledPickUpPerformable",
+    "PredictedPickUpPerformable",
     "default_policy",
     "learn",
     "Policy",
+    "PolarPolicy",
+    "SuccessModel",
+    "Draws",
     "PickUpChoice",
+    "PickUpContext",
+    "Edge",
+    "context_of",
     "Evidence",
     "Region",
     "Rectangle",

@@ -19,7 +19,8 @@ from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
 from pycrorm_async.learning.cluster import RolloutPool, rollout_pool
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy, name_of
+from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy
+from pycrorm_async.learning.policy_file import name_of
 from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask
 from pycrorm_async.learning.recorded_policy import record_policy
 from pycrorm_async.learning.rollouts import Tally, tally_of

@@ -5,15 +5,19 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+import math
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Select, select
+from sqlalchemy import Select, func, select
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition
+from pycrorm_async.learning.features import Edge, PickUpContext
+from pycrorm_async.learning.polar_policy import PolarPolicy
 from pycrorm_async.learning.policy import (
     ARMS,
     GRASPS,
@@ -23,18 +27,20 @@ from pycrorm_async.learning.policy import (
     Rectangle,
     Region,
     default_policy,
-    name_of,
 )
+from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import keep_policy
+from pycrorm_async.learning.success_model import SuccessModel
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan import objects
-from pycrorm_async.plan.actions import MoveAndPickUpPerformable
-from pycrorm_async.plan.failures import ObjectUnreachable
+from pycrorm_async.plan.actions import MoveAndPickUpPerformable, MoveTorsoActionPerformable
+from pycrorm_async.plan.failures import ObjectUnreachable, Resource
 from pycrorm_async.plan.geometry import lifting_arms
 from pycrorm_async.plan.language import ActionDescription
 from pycrorm_async.plan.locations import BaseClearance, base_clearance, base_height_m, face
 from pycrorm_async.plan.task import Experience, PastSuccess, experience
 from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.bounding_boxes import box_around
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Arms, Grasp, Pose, rotated
 from pycrorm_async.world.queries import Costmap, OccupancyCostmap, VisibilityCostmap
@@ -113,6 +119,59 @@ def _runs(cells: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
+# === context ==================================================================================================
+#
+# Read the circumstances of a pick-up from the world: heights, the object's box, and the surface below it.
+
+_NEAR_SURFACE_M = 0.03
+"""The greatest distance in m between the underside of an object and the surface that it stands on."""
+
+
+def context_of(target: Object) -> PickUpContext:
+    """Return the circumstances of picking this object up with the acting robot. Moves nothing.
+
+    The edges are those of the box around the link that the object stands on, as seen from above. Raises `NoRobotHere`.
+    """
+    robot, pose = objects.require_robot(), target.pose
+    joint = robot.description.torso_joint
+    frames = [(target.link_pose(link).relative_to(pose), target.body.solids[link]) for link in target.links]
+    box = box_around([((frame.position, frame.orientation), solids) for frame, solids in frames])
+    return PickUpContext(
+        height=pose.position.z - robot.body.pose.position.z,
+        torso=0.0 if joint is None else robot.body.joint_position(joint),
+        torso_limits=None if joint is None else robot.body.joint_limits(joint),
+        size=None if box is None else (box.size.x, box.size.y, box.size.z),
+        origin_height=math.nan if box is None else -box.min.z,
+        edges=() if box is None else tuple(_edges_below(robot, target, -box.min.z)),
+    )
+
+
+def _edges_below(robot: objects.CurrentRobot, target: Object, origin_height: float) -> Iterator[Edge]:
+    """Yield the edges of the surface that the object stands on, in its own frame; none for an object in the air."""
+    x, y, z = target.pose.position
+    below = (x, y, z - origin_height - _NEAR_SURFACE_M)
+    [support] = target.world.ray_test([(x, y, z)], [below], ignore=[target, *robot.with_load()])
+    if support is None:
+        return
+    point, tops = Pose(below), []
+    for link in support.links:
+        box = support.box_in_link(link)
+        if box is None:
+            continue
+        frame = support.link_pose(link)
+        at = point.relative_to(frame).position
+        if all(low <= here <= high for low, here, high in zip(box.min[:2], at[:2], box.max[:2], strict=True)):
+            top = frame.position.z + box.max.z - below[2]
+            if 0 <= top <= 2 * _NEAR_SURFACE_M:
+                tops.append((top, frame, at, box))
+    if tops:
+        _, frame, at, box = max(tops, key=lambda each: each[0])
+        turned = frame.yaw - target.pose.yaw
+        for axis, angle in ((0, 0.0), (1, math.pi / 2)):
+            yield Edge(box.max[axis] - at[axis], turned + angle)
+            yield Edge(at[axis] - box.min[axis], turned + angle + math.pi)
+
+
 # === move and pick up =========================================================================================
 #
 # Describe move-and-pick-up actions whose arm, grasp and base position are sampled from a policy (thesis 5.2).
@@ -126,6 +185,49 @@ _UPRIGHT_MIN = 0.1
 plane no longer maps to the floor."""
 
 
+PROPOSALS = 300
+"""Ways to pick up of which a success model ranks the likeliest first."""
+DRAWN_FROM = 100
+"""Ways to pick up of which one is drawn in a rollout: more would give nothing but a slower rollout."""
+
+
+@dataclass
+class PredictedPickUpPerformable(MoveAndPickUpPerformable):
+    """Set the torso, drive to a place, face the object from there, and pick it up, in a way that a model ranked.
+
+    The attributes are recorded with the way, so that a model can be fitted to the nodes alone, and its predictions be
+    compared with what happened. None stands for what is not known.
+
+    Attributes:
+        probability: of success, 0 to 1, as the model predicted it; None for a way that no model rates.
+        torso: height of the lifted torso, m; it is set first. None leaves it as it is.
+        relative_x, relative_y: of the place in the object's own frame, m.
+        height: of the object over the lifted torso, m.
+        width, depth, origin_height, edge_distance, edge_angle: see `features.CIRCUMSTANCES`.
+    """
+
+    probability: float | None = field(default=None, kw_only=True)
+    torso: float | None = field(default=None, kw_only=True)
+    relative_x: float = field(kw_only=True)
+    relative_y: float = field(kw_only=True)
+    height: float = field(kw_only=True)
+    width: float | None = field(default=None, kw_only=True)
+    depth: float | None = field(default=None, kw_only=True)
+    origin_height: float | None = field(default=None, kw_only=True)
+    edge_distance: float | None = field(default=None, kw_only=True)
+    edge_angle: float | None = field(default=None, kw_only=True)
+
+    def resources(self) -> frozenset[Resource]:
+        own = super().resources()
+        return own if self.torso is None else own | {Resource.TORSO}
+
+    async def perform(self) -> None:
+        robot = objects.require_robot()
+        if self.torso is not None and robot.body.joint_position(robot.torso_joint()) != self.torso:
+            await MoveTorsoActionPerformable(self.torso).perform()
+        await super().perform()
+
+
 class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     """A description whose alternatives for moving to an object and picking it up are samples of a policy.
 
@@ -136,7 +238,9 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     Args:
         target: the object, or a description of it.
         arms, grasps: the allowed ones; None allows all.
-        policy: the distribution of base positions, arms and grasps; None means the thesis' default policy.
+        policy: the distribution of base positions, arms and grasps; None means the thesis' default policy. With a
+            `SuccessModel` the likeliest of `PROPOSALS` ways of the default policy, each with a random height of the
+            torso, are tried; each alternative has its `probability`, so that a plan can refuse one below a bound.
         samples: number of alternatives.
         rng: random generator; None means a new one with an unpredictable seed.
 
@@ -144,7 +248,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     in an episode records the policy's content, once for each opened memory (`read_policy`).
 
     Raises `ImpossibleCondition` if the policy gives these arms or grasps no probability, `CallerError` if
-    samples < 1.
+    samples < 1, and when it is iterated if the model was fitted to another robot.
     """
 
     def __init__(
@@ -152,7 +256,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         target: objects.ObjectLike | objects.ObjectDesignatorDescription,
         arms: Iterable[Arms] | None = None,
         grasps: Iterable[Grasp] | None = None,
-        policy: Policy | None = None,
+        policy: AnyPolicy | None = None,
         *,
         samples: int = 20,
         rng: np.random.Generator | None = None,
@@ -171,7 +275,9 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         )
         self._passed_policy = policy = default_policy() if policy is None else policy
         self.policy_name = name_of(policy)
-        self.policy: Policy = policy if evidence == Evidence() else policy.condition(evidence)
+        self._model = None if isinstance(policy, Policy) else policy
+        places = policy if isinstance(policy, Policy) else default_policy()
+        self.policy: Policy = places if evidence == Evidence() else places.condition(evidence)
         self.samples = samples
         self._rng = np.random.default_rng() if rng is None else rng
 
@@ -200,6 +306,25 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             view.robot_in_object_y.label("object_y"),
             view.height_over_torso.label("height"),
         ).where(view.status == TaskStatus.SUCCEEDED)
+
+    @staticmethod
+    def query_with_failures() -> Select[Arms, Grasp, float, float, float, float | None, TaskStatus, str | None]:
+        """Select the pick-ups of all episodes that succeeded or failed, the input of `SuccessModel.fit`.
+
+        A data frame of it has the columns of `query_for_database` and torso_height (m), status and robot. The height
+        of a robot without a torso is that over its base. It can be cut in the same way.
+        """
+        view = PickUpWithContextView
+        return select(
+            view.arm,
+            view.grasp,
+            view.robot_in_object_x.label("object_x"),
+            view.robot_in_object_y.label("object_y"),
+            func.coalesce(view.height_over_torso, -view.robot_in_object_z).label("height"),
+            view.torso_height,
+            view.status,
+            view.robot,
+        ).where(view.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
 
     # --- policies for the current scene -----------------------------------------------------------------------
 
@@ -244,53 +369,134 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none fits."""
-        yield from map(self.chosen, self.choices())
-
-    def choices(self) -> Iterator[PickUpChoice]:
-        """Yield the choices of `__iter__`."""
         self.keep_policy()
-        yield from self._likeliest_first(self.grounded())
+        if self._model is not None:
+            yield from self._ranked(self._model)
+            return
+        yield from map(self.chosen, self._likeliest_first(self.grounded()))
+
+    def drawn(self, rng: np.random.Generator, policy: Policy | None = None) -> MoveAndPickUpPerformable:
+        """Return one sample, without regard to obstacles and visibility; `policy` saves `policy_here`.
+
+        Of a `SuccessModel`, one of `DRAWN_FROM` proposals, by its `draws`. Raises `ObjectUnreachable`.
+        """
+        if self._model is None:
+            return self.chosen((self.policy_here() if policy is None else policy).sample(rng)[0])
+        context = self._context(self._model)
+        proposals = self._proposals(self._model, rng, DRAWN_FROM, context, self.policy_here())
+        if isinstance(self._model, SuccessModel):
+            return self._predicted(self._model, [self._model.draw(rng, proposals, context)], context)[0]
+        return self._predicted(self._model, proposals[:1], context)[0]
+
+    def _ranked(self, model: SuccessModel | PolarPolicy) -> Iterator[PredictedPickUpPerformable]:
+        context, policy = self._context(model), self.grounded()
+        proposals = self._proposals(model, self._rng, max(PROPOSALS, self.samples), context, policy)
+        rate = model.probability if isinstance(model, SuccessModel) else model.likelihood
+        best = np.argsort(-rate(proposals, context), kind="stable")[: self.samples]
+        yield from self._predicted(model, [proposals[number] for number in best], context)
+
+    def _context(self, model: SuccessModel | PolarPolicy) -> PickUpContext:
+        robot = objects.require_robot()
+        if isinstance(model, SuccessModel) and model.robot not in (None, robot.body.name, robot.description.name):
+            message = f"the success model {self.policy_name} was fitted to pick-ups of {model.robot}"
+            raise CallerError(f"{message}, this robot is {robot.body.name}: pass a model of this robot")
+        return context_of(objects.in_world(self.target))
+
+    def _proposals(
+        self,
+        model: SuccessModel | PolarPolicy,
+        rng: np.random.Generator,
+        count: int,
+        context: PickUpContext,
+        policy: Policy,
+    ) -> Sequence[PickUpChoice]:
+        """Return ways to pick up at places of `policy`, the default policy here. Raises `ObjectUnreachable`."""
+        if isinstance(model, SuccessModel):
+            choices = self._clear_choices(lambda number: policy.sample(rng, number), count)
+            if context.torso_limits is None:
+                return choices
+            torsos = rng.uniform(*context.torso_limits, len(choices)).tolist()
+            return [each._replace(torso=torso) for each, torso in zip(choices, torsos, strict=True)]
+
+        def draw(number: int) -> list[PickUpChoice]:
+            drawn = model.sample(rng, number, context, policy.evidence)
+            places = np.array([each[2:4] for each in drawn]).T
+            region = policy.evidence.region
+            return drawn if region is None else list(compress(drawn, region.contains(*places)))
+
+        try:
+            return self._clear_choices(draw, count, every=True)
+        except ImpossibleCondition as impossible:
+            message = f"the policy has no way to pick up {self.target.name} here: {impossible}"
+            raise ObjectUnreachable(message, self.target.name) from impossible
+
+    def _predicted(
+        self, model: SuccessModel | PolarPolicy, choices: Sequence[PickUpChoice], context: PickUpContext
+    ) -> list[PredictedPickUpPerformable]:
+        """Return the actions of these choices, each with the model's prediction and its circumstances."""
+        shares: list[float] | list[None] = [None] * len(choices)
+        if isinstance(model, SuccessModel) and model.trees:
+            shares = model.probability(choices, context).tolist()
+        known = {name: values.tolist() for name, values in context.circumstances(choices).items()}
+        actions: list[PredictedPickUpPerformable] = []
+        for number, (choice, share) in enumerate(zip(choices, shares, strict=True)):
+            move = self.chosen(choice)
+            own = {name: None if math.isnan(values[number]) else values[number] for name, values in known.items()}
+            actions.append(
+                PredictedPickUpPerformable(
+                    move.standing_position, move.object_designator, move.arm, move.grasp, policy=self.policy_name,
+                    probability=share, torso=choice.torso, relative_x=choice.relative_x, relative_y=choice.relative_y,
+                    height=context.height - (context.torso if choice.torso is None else choice.torso), **own,
+                )
+            )  # fmt: skip
+        return actions
 
     def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples from around the mode of the grounded policy only, as the thesis' `iter_with_mode` does.
 
-        Raises `ObjectUnreachable`.
+        Raises `ObjectUnreachable`, and `CallerError` for a model, which has no mode.
         """
+        if self._model is not None:
+            raise CallerError(f"{self.policy_name} has no mode: iterate over its alternatives, the likeliest first")
         self.keep_policy()
         yield from map(self.chosen, self._likeliest_first(self.grounded().mode()))
 
     def plain(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples in the order they are drawn, without regard to obstacles and visibility."""
         self.keep_policy()
-        for choice in self.policy_here().sample(self._rng, self.samples):
-            yield self.chosen(choice)
+        policy = self.policy_here()
+        for _ in range(self.samples):
+            yield self.drawn(self._rng, policy)
 
     def keep_policy(self) -> None:
         """Record the policy's content in the open episode, once for each opened memory."""
         keep_policy(self.policy_name, self._passed_policy)
 
     def _likeliest_first(self, policy: Policy) -> Iterator[PickUpChoice]:
-        choices = self._clear_choices(policy)
+        choices = self._clear_choices(lambda number: policy.sample(self._rng, number), self.samples)
         for number in np.argsort(-policy.likelihood(choices), kind="stable"):
             yield choices[number]
 
-    def _clear_choices(self, policy: Policy) -> Sequence[PickUpChoice]:
-        """Draw samples; where collisions count, only those where the base is clear before and after it turns.
+    def _clear_choices(
+        self, draw: Callable[[int], list[PickUpChoice]], count: int, *, every: bool = False
+    ) -> Sequence[PickUpChoice]:
+        """Draw `count` ways; where collisions count, only those where the base is clear before and after it turns.
 
-        Raises `ObjectUnreachable` if collisions count and none of `_DRAWS_MAX` times as many samples is clear.
+        With `every`, `draw` may return fewer than it is asked for. Raises `ObjectUnreachable` if none of `_DRAWS_MAX`
+        times as many is possible.
         """
         clearance = base_clearance()
-        if clearance is None:
-            return policy.sample(self._rng, self.samples)
+        if clearance is None and not every:
+            return draw(count)
         clear: list[PickUpChoice] = []
         for _ in range(_DRAWS_MAX):
-            clear += [each for each in policy.sample(self._rng, self.samples) if self.is_clear(each, clearance)]
-            if len(clear) >= self.samples:
+            clear += [each for each in draw(count) if clearance is None or self.is_clear(each, clearance)]
+            if len(clear) >= count:
                 break
         if not clear:
             message = f"the base would be in collision at every place to pick up {self.target.name}"
             raise ObjectUnreachable(message, self.target.name)
-        return clear[: self.samples]
+        return clear[:count]
 
     def is_clear(self, choice: PickUpChoice, clearance: BaseClearance) -> bool:
         """Return whether the base is clear of obstacles at its place, before and after it turns to the object."""
@@ -341,7 +547,7 @@ class RecalledPickUpPerformable(MoveAndPickUpPerformable):
     expected_success: float | None = None
 
 
-class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
+class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
     """A description whose alternatives for moving to an object and picking it up are those of earlier tries.
 
     Each alternative is the way with the highest expected success at the object's height over the lifted torso. The
@@ -367,7 +573,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         target: objects.ObjectLike | objects.ObjectDesignatorDescription,
         arms: Iterable[Arms] | None = None,
         grasps: Iterable[Grasp] | None = None,
-        policy: Policy | None = None,
+        policy: AnyPolicy | None = None,
         *,
         experience: Experience | None = None,
         samples: int = 20,
@@ -388,17 +594,17 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
     def __repr__(self) -> str:
         return f"RecalledPickUp({self.target.name!r}, otherwise={self._otherwise[0][1]})"
 
-    async def resolve(self) -> RecalledPickUpPerformable:  # type: ignore[override]  # a memory is asked
+    async def resolve(self) -> MoveAndPickUpPerformable:  # type: ignore[override]  # a memory is asked
         """Return the first alternative. Raises `ObjectUnreachable` if there is none."""
         async for each in self:
             return each
         raise ObjectUnreachable(f"there is no way to pick up {self.target.name} here", self.target.name)
 
-    def __iter__(self) -> Iterator[RecalledPickUpPerformable]:
+    def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
         """Raise `CallerError`, because the memory is queried between two alternatives."""
         raise CallerError("a recalled pick-up asks the memory: iterate with `async for`, or `await …resolve()`")
 
-    async def __aiter__(self) -> AsyncIterator[RecalledPickUpPerformable]:
+    async def __aiter__(self) -> AsyncIterator[MoveAndPickUpPerformable]:
         """Yield the way with the highest expected success that was not yielded yet, then the policy's samples."""
         source = self._experience if self._experience is not None else experience.get()
         if source is not None:
@@ -410,16 +616,17 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
             while (best := await self._best(source, region, clearance, tried)) is not None:
                 choice, way = best
                 tried.add(choice)
-                yield self._performable_of(choice, "recall", expected=way.score)
+                recalled = replace(self._default.chosen(choice), policy=None)
+                yield self._performable_of(recalled, "recall", expected=way.score)
         for description, chosen_by in self._otherwise:
             try:
-                choices = [*description.choices()]
+                moves = list(description)
             except ObjectUnreachable:
                 if description is self._default:
                     raise
                 continue  # a learned policy may know no way at this height
-            for each in choices:
-                yield self._performable_of(each, chosen_by, policy=description.policy_name)
+            for move in moves:
+                yield self._performable_of(move, chosen_by)
 
     async def _best(
         self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]
@@ -447,9 +654,9 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         return None
 
     def _performable_of(
-        self, choice: PickUpChoice, chosen_by: str, *, expected: float | None = None, policy: str | None = None
-    ) -> RecalledPickUpPerformable:
-        move = self._default.chosen(choice)
-        return RecalledPickUpPerformable(
-            move.standing_position, move.object_designator, move.arm, move.grasp, chosen_by, expected, policy=policy
-        )
+        self, move: MoveAndPickUpPerformable, chosen_by: str, *, expected: float | None = None
+    ) -> MoveAndPickUpPerformable:
+        if isinstance(move, PredictedPickUpPerformable):
+            return move
+        place, target, policy = move.standing_position, move.object_designator, move.policy
+        return RecalledPickUpPerformable(place, target, move.arm, move.grasp, chosen_by, expected, policy=policy)

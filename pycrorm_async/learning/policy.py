@@ -15,25 +15,11 @@ Lengths are in metres, in the object's own frame.
 
 >>> near = Region((Rectangle(-1.0, -0.5, -0.3, 0.3),))
 >>> evidence = Evidence(arms=frozenset({Arms.LEFT}), region=near)
-
-**Policy file.** Read and write policy files: two lines of JSON, a heading with the second line's checksum, then the
-policy.
-
-    {"format":"pycrorm policy","version":1,"crc32":2868103911}
-    {"arms":["LEFT","RIGHT"],"grasps":["FRONT","LEFT","RIGHT","TOP"],"leaves":[...],"evidence":{...},...}
-
-Numbers are written with all their digits, so that a policy read back gives the same likelihoods in every process.
-`arms` and `grasps` name the members that the leaves' probabilities belong to, in order. No pickle is used, so a file
-from an untrusted source cannot run code. Reading a policy and sampling it need none of the packages that learning
-needs.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-import zlib
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -45,7 +31,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra, PolicyDamaged, PolicyFileRefused
+from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra
 from pycrorm_async.world.pose import Arms, Grasp
 
 # === evidence =================================================================================================
@@ -286,12 +272,14 @@ class PickUpChoice(NamedTuple):
 
     Attributes:
         relative_x, relative_y: position of the robot's base, m, in the object's own frame.
+        torso: height of the lifted torso, m; None leaves it as it is.
     """
 
     arm: Arms
     grasp: Grasp
     relative_x: float
     relative_y: float
+    torso: float | None = None
 
 
 class Leaf(msgspec.Struct, frozen=True):
@@ -525,127 +513,6 @@ def default_policy() -> Policy:
     place = Normal(0.0, math.sqrt(VARIANCE_M2))
     anywhere = Leaf(1.0, (1 / len(ARMS),) * len(ARMS), (1 / len(GRASPS),) * len(GRASPS), place, place)
     return Policy((anywhere,), Evidence(region=AROUND_OBJECT))
-
-
-# === policy file ==============================================================================================
-
-FORMAT = "pycrorm policy"
-VERSION = 1
-
-
-class _Heading(msgspec.Struct, frozen=True):
-    format: str
-    version: int
-    crc32: int
-
-
-class _Evidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Evidence as written: members by name, rectangles as x_min, x_max, y_min, y_max."""
-
-    arms: list[str] | None
-    grasps: list[str] | None
-    region: list[Rectangle] | None
-    height: tuple[float, float] | None
-
-
-class _Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    arms: list[str]
-    grasps: list[str]
-    leaves: tuple[Leaf, ...]
-    evidence: _Evidence
-    constant_height: float | None
-
-
-def save_policy(policy: Policy, path: Path | str) -> None:
-    """Write the policy to the file and replace its content atomically: a reader gets the old policy or the new one.
-
-    Raises `PolicyFileRefused` if the file cannot be written.
-    """
-    path, content = Path(path), encode_policy(policy)
-    heading = msgspec.json.encode(_Heading(FORMAT, VERSION, zlib.crc32(content)))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(heading + b"\n" + content + b"\n")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise PolicyFileRefused(path, f"cannot be written: {error.strerror or error}") from None
-
-
-def name_of(policy: Policy) -> str:
-    """Return the policy's name, 12 hexadecimal digits: a hash of its content, the same in every process."""
-    return hashlib.blake2b(encode_policy(policy), digest_size=6).hexdigest()
-
-
-def encode_policy(policy: Policy) -> bytes:
-    """Return the policy as JSON; equal policies give equal bytes in every process."""
-    return msgspec.json.encode(
-        _Policy(
-            [each.name for each in ARMS],
-            [each.name for each in GRASPS],
-            policy.leaves,
-            _encode_evidence(policy.evidence),
-            policy.constant_height,
-        )
-    )
-
-
-def load_policy(path: Path | str) -> Policy:
-    """Read a policy that `save_policy` wrote.
-
-    Raises:
-        PolicyFileRefused: the file does not exist, is not a policy file, or has another format version.
-        PolicyDamaged: the content differs from what was written.
-    """
-    path = Path(path)
-    try:
-        first, _, rest = path.read_bytes().partition(b"\n")
-    except OSError as error:
-        raise PolicyFileRefused(path, f"cannot be read: {error.strerror or error}") from None
-    try:
-        heading = msgspec.json.decode(first, type=_Heading)
-    except msgspec.DecodeError:
-        heading = _Heading("", 0, 0)
-    if heading.format != FORMAT:
-        raise PolicyFileRefused(path, "holds no policy: pass a file written by `save_policy` or `pycrorm learn`")
-    if heading.version != VERSION:
-        raise PolicyFileRefused(path, f"has format version {heading.version}, but this program reads {VERSION}")
-    content = rest.removesuffix(b"\n")
-    if zlib.crc32(content) != heading.crc32:
-        raise PolicyDamaged(path, "its checksum does not match its content")
-    try:
-        return decode_policy(content)
-    except (msgspec.DecodeError, CallerError, ImpossibleCondition, KeyError, ValueError) as error:
-        raise PolicyDamaged(path, f"its checksum matches, but it holds no policy: {error}") from None
-
-
-def decode_policy(encoded: bytes) -> Policy:
-    """Return the policy that `encode_policy` wrote. Raises `msgspec.DecodeError` or another `ValueError`."""
-    content = msgspec.json.decode(encoded, type=_Policy)
-    if (content.arms, content.grasps) != ([each.name for each in ARMS], [each.name for each in GRASPS]):
-        raise ValueError(f"unexpected members: probabilities of arms {content.arms} and grasps {content.grasps}")
-    if not math.isclose(sum(leaf.weight for leaf in content.leaves), 1, rel_tol=1e-6):
-        raise ValueError("the weights of the leaves do not sum to one")
-    evidence = content.evidence
-    return Policy(
-        content.leaves,
-        Evidence(
-            arms=None if evidence.arms is None else frozenset(Arms[name] for name in evidence.arms),
-            grasps=None if evidence.grasps is None else frozenset(Grasp[name] for name in evidence.grasps),
-            region=None if evidence.region is None else Region(tuple(evidence.region)),
-            height=evidence.height,
-        ),
-        content.constant_height,
-    )
-
-
-def _encode_evidence(evidence: Evidence) -> _Evidence:
-    return _Evidence(
-        None if evidence.arms is None else sorted(each.name for each in evidence.arms),
-        None if evidence.grasps is None else sorted(each.name for each in evidence.grasps),
-        None if evidence.region is None else list(evidence.region.rectangles),
-        evidence.height,
-    )
 
 
 # === policy plot ==============================================================================================

@@ -46,7 +46,7 @@ from typing import Any, Self
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, PycrormError, SpoolTaken
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.policy import Policy, name_of
+from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.rollouts import Tally, batch_rollout
 from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.memory import Memory
@@ -87,7 +87,7 @@ class RolloutTask:
     """
 
     scene: Scene
-    policy: Policy
+    policy: AnyPolicy
     seed: int
     recorded: bool = True
     episode_each: bool = False

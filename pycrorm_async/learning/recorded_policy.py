@@ -17,7 +17,7 @@ from sqlalchemy import Select, and_, or_, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Blob
-from pycrorm_async.learning.policy import Policy, decode_policy, encode_policy, name_of
+from pycrorm_async.learning.policy_file import AnyPolicy, decode_policy, encode_policy, name_of
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import LearnPolicyAction, Observation, ObservationValue
 from pycrorm_async.plan.language import ActionAbstract
@@ -52,7 +52,7 @@ class LearnPolicyActionPerformable(ActionAbstract):
 
 async def record_policy(
     memory: Memory,
-    policy: Policy,
+    policy: AnyPolicy,
     *,
     episodes: Iterable[str],
     successes: int,
@@ -77,7 +77,7 @@ async def record_policy(
     return name
 
 
-def keep_policy(name: str, policy: Policy) -> None:
+def keep_policy(name: str, policy: AnyPolicy) -> None:
     """Record the content of a policy that is used, in the open episode; once for each opened memory."""
     here = observing()
     if here is not None:
@@ -100,7 +100,7 @@ def policy_contents(name: str) -> Select[str | None]:
     )
 
 
-async def read_policy(reading: Reading, name: str) -> Policy:
+async def read_policy(reading: Reading, name: str) -> AnyPolicy:
     """Return the recorded policy with this name. Raises `CallerError` if the memory does not hold it."""
     async with reading.session() as session:
         hash_ = await session.scalar(policy_contents(name).limit(1))

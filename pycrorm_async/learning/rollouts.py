@@ -279,9 +279,7 @@ class BatchRolloutActionPerformable(ActionAbstract):
         for index in self._indexes(run):
             action = run.action if run.prepare is None else run.action.of(run.prepare(self.seed, index))
             try:
-                policy = action.policy_here() if run.policy is None else run.policy
-                choice = policy.sample(randomness(self.seed, index))[0]
-                await action.chosen(choice).perform()
+                await action.drawn(randomness(self.seed, index), run.policy).perform()
             except PlanFailure as failure:
                 run.tally.failures[type(failure).__name__] += 1
             else:

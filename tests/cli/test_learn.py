@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from pycrorm_async.cli import learn as learn_command
-from pycrorm_async.learning import default_policy, load_policy, name_of
+from pycrorm_async.learning import Policy, default_policy, load_policy, name_of
 from pycrorm_async.learning.experiment import ExperimentResult, KitchenResult, Phase
 from pycrorm_async.learning.rollouts import Tally
 from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
@@ -93,6 +93,7 @@ def test_an_interrupt_is_one_line_and_resume_performs_the_rest_and_prints_all(tm
     assert (default["failures"], sum(default["stages"].values())) == ({"IKError": failed}, failed)
     assert document["successes"] == default["successes"]
     saved = load_policy(tmp_path / document["policy"]["file"])
+    assert isinstance(saved, Policy)
     assert (name_of(saved), len(saved.leaves)) == (document["policy"]["name"], document["policy"]["leaves"])
     assert (learned["policy"], held_out["policy"]) == (document["policy"]["name"], default["policy"])
     assert (tmp_path / document["figure"]).read_bytes().startswith(b"\x89PNG")

@@ -19,13 +19,15 @@ MILK = Pose((1.3, 1.0, 0.9))
 
 
 def succeeds(choice: PickUpChoice, milk: Pose = MILK) -> bool:
-    """Return whether a PR2 that faces the milk from there, torso down, arms stretched ahead, picks it up."""
+    """Return whether a PR2 that faces the milk from there, arms stretched ahead, picks it up; its torso is down, or as
+    the choice has it.
+    """
     floor = milk @ Pose((choice.relative_x, choice.relative_y, -milk.position.z))
     ahead = math.atan2(milk.position.y - floor.position.y, milk.position.x - floor.position.x)
     base = Pose(floor.position, yaw_quaternion(ahead))
     try:
         for goal in pick_up_poses(milk, choice.grasp, base):
-            solve_from(PR2, choice.arm, goal, base=base, torso_height=0.0)
+            solve_from(PR2, choice.arm, goal, base=base, torso_height=choice.torso or 0.0)
     except Unreachable:
         return False
     return True

@@ -332,7 +332,7 @@ def recalled(stage: Stage, experience: Known, **options: object) -> RecalledPick
 
 
 async def alternatives(description: RecalledPickUp) -> list[RecalledPickUpPerformable]:
-    return [each async for each in description]
+    return [each async for each in description if isinstance(each, RecalledPickUpPerformable)]
 
 
 def offset(stage: Stage, action: RecalledPickUpPerformable) -> tuple[float, float]:

@@ -29,9 +29,8 @@ from pycrorm_async.learning.policy import (
     Rectangle,
     Region,
     default_policy,
-    load_policy,
-    save_policy,
 )
+from pycrorm_async.learning.policy_file import load_policy, save_policy
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.tree import learn
 from pycrorm_async.orm import (
@@ -275,7 +274,7 @@ for name in ("jpt", "pandas", "scipy", "matplotlib"):
     sys.modules[name] = None
 from pathlib import Path
 import numpy as np
-from pycrorm_async.learning.policy import load_policy
+from pycrorm_async.learning.policy_file import load_policy
 for path in sys.argv[1:]:
     policy = load_policy(Path(path))
     print(policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist())
@@ -339,8 +338,8 @@ def test_no_cut_yields_another_policy(tmp_path: Path) -> None:
 
 def test_another_version_is_refused_by_its_number(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
-    path.write_text('{"format":"pycrorm policy","version":2,"crc32":0,"more":1}\n{"nodes":[]}\n')
-    with pytest.raises(PolicyFileRefused, match="has format version 2, but this program reads 1"):
+    path.write_text('{"format":"pycrorm policy","version":3,"crc32":0,"more":1}\n{"nodes":[]}\n')
+    with pytest.raises(PolicyFileRefused, match="has format version 3, but this program reads 1 to 2"):
         load_policy(path)
 
 
@@ -437,6 +436,7 @@ async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp
         read = await read_policy(memory.reading, name)
         async with memory.session() as session:
             (learned,) = (await session.scalars(select(LearnPolicyAction))).all()
+    assert isinstance(read, Policy)
     assert name == name_of(policy) == name_of(read) == learned.policy
     assert read.sample(np.random.default_rng(1), 5) == policy.sample(np.random.default_rng(1), 5)
     assert (learned.successes, learned.min_samples_leaf, learned.rollouts, learned.scene) == (7, 3, None, None)

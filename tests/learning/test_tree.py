@@ -167,7 +167,7 @@ def test_from_a_single_base_position_only_that_one_is_learned() -> None:
     policy = learn(pd.DataFrame(ALIKE))
     choices = policy.sample(rng(), 100)
     assert {each[:2] for each in choices} == {(Arms.LEFT, Grasp.FRONT)}
-    assert all(math.dist(each[2:], (0.5, 0.1)) < 0.0015 for each in choices)
+    assert all(math.dist((each.relative_x, each.relative_y), (0.5, 0.1)) < 0.0015 for each in choices)
     assert policy.coverage([PickUpChoice(Arms.LEFT, Grasp.FRONT, 0.5, 0.1)]) == 1.0
 
 

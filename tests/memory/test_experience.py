@@ -15,7 +15,7 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
-from pycrorm_async.learning import MoveAndPickUp, PickUpChoice, RecalledPickUp, Scene
+from pycrorm_async.learning import MoveAndPickUp, PickUpChoice, RecalledPickUp, RecalledPickUpPerformable, Scene
 from pycrorm_async.orm import LocationCandidate, LocationResolution
 from pycrorm_async.plan import (
     DatabaseCostmapLocation,
@@ -195,12 +195,14 @@ async def test_a_failure_is_recalled_at_once_and_the_next_try_is_elsewhere(
                 stage.reset()
             alternatives = aiter(RecalledPickUp(stage.target, rng=np.random.default_rng(1)))
             first = await anext(alternatives)
+            assert isinstance(first, RecalledPickUpPerformable)
             assert (first.chosen_by, first.grasp) == ("recall", Grasp.FRONT)  # two successes beside each other
             with monkeypatch.context() as patched, pytest.raises(IKError):
                 patched.setattr(MoveTCPMotion, "perform", fail)
                 await first.perform()
             stage.reset()
             second = await anext(alternatives)
+            assert isinstance(second, RecalledPickUpPerformable)
             assert (second.chosen_by, second.grasp) == ("recall", Grasp.RIGHT)  # and not the other one beside it
             assert first.expected_success is not None
             assert second.expected_success is not None

@@ -228,10 +228,10 @@ async def test_retry_with_failure(scene: Scene) -> None:
 
 
 def test_create_model() -> None:
-    """No base pose is inside the object; there are four variables."""
+    """No base pose is inside the object; there are four variables, and here a fifth, the torso."""
     centre = Region((Rectangle(-0.2, 0.2, -0.2, 0.2),))
     assert default_policy().probability(Evidence(region=centre)) == 0
-    assert PickUpChoice._fields == ("arm", "grasp", "relative_x", "relative_y")
+    assert PickUpChoice._fields == ("arm", "grasp", "relative_x", "relative_y", "torso")
 
 
 def test_grounding(scene: Scene) -> None:
