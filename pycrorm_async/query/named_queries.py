@@ -299,6 +299,15 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
     return list(_depth_first(children))
 
 
+async def observed_contents(connection: AsyncConnection, number: int) -> list[tuple[str, int, int | None]]:
+    """Return name, event and node of each observation of an episode that has a content."""
+    observation, value = orm.Observation, orm.ObservationValue
+    contents = select(value.id).where(value.process_metadata_id == number, value.blob.is_not(None))
+    observed = select(observation.name, observation.id, observation.node_id).where(observation.id.in_(contents))
+    rows = await connection.execute(observed)
+    return [(row.name, row_key(row.id).sequence, row.node_id) for row in rows]
+
+
 async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
     """Return the numbers of the simulations of this episode, by the id of the node that performed them."""
     episodes = orm.ProcessMetaData.__table__

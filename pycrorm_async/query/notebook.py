@@ -18,6 +18,7 @@ from pycrorm_async.query.text import folding_text, node_text, one_line, value_ht
 
 if TYPE_CHECKING:
     from pycrorm_async.query.notebook_html import Axis
+    from pycrorm_async.query.observed_images import ObservedPicture
     from pycrorm_async.query.text import Drawing
 
 Item = TypeVar("Item")
@@ -79,7 +80,10 @@ class TaskTree(_Listing[NodeSummary]):
 
     Attributes:
         episode: to which they belong; None in a list that was not read from a memory.
+        pictures: of what they observed, which a notebook draws at them.
     """
+
+    pictures: tuple[ObservedPicture, ...] = ()
 
     def __init__(self, nodes: Iterable[NodeSummary] = (), episode: EpisodeSummary | None = None) -> None:
         super().__init__(nodes)
@@ -92,7 +96,9 @@ class TaskTree(_Listing[NodeSummary]):
         return gantt(self, axis)
 
     def _part(self, items: Iterable[NodeSummary]) -> TaskTree:
-        return type(self)(items, self.episode)
+        part = type(self)(items, self.episode)
+        part.pictures = self.pictures
+        return part
 
     def __repr__(self) -> str:
         return _text((f"{'  ' * each.depth}{node_text(each)}" for each in self), len(self))
@@ -100,7 +106,7 @@ class TaskTree(_Listing[NodeSummary]):
     def _repr_html_(self) -> str:
         from pycrorm_async.query.notebook_html import task_tree_html
 
-        return task_tree_html(self, self.episode)
+        return task_tree_html(self, self.episode, self.pictures)
 
 
 # === the views of values ======================================================================================

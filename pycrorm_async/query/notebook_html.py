@@ -11,7 +11,7 @@ import html
 import math
 from collections.abc import Mapping, Sequence
 from random import Random
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
 
@@ -22,6 +22,9 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, count
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.query.sql import SqlResult
 from pycrorm_async.query.text import facts, status
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.observed_images import ObservedPicture
 
 EPISODES_MAX = 100
 """Bounds the rows of a table of episodes."""
@@ -89,7 +92,9 @@ def _failed_actions(each: EpisodeSummary) -> str:
     return texts.quiet(each.status_text.removeprefix(each.status))
 
 
-def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None) -> str:
+def task_tree_html(
+    nodes: Sequence[NodeSummary], episode: EpisodeSummary | None, pictures: Sequence[ObservedPicture] = ()
+) -> str:
     """Return the title of the episode, a chart of its nodes over events, and the nodes as nested lists."""
     count = f"{len(nodes):,} node{'s' * (len(nodes) != 1)}"
     if episode is None:
@@ -100,7 +105,7 @@ def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None)
     if not nodes:
         return texts.view(title)
     chart = f'<div style="max-height:340px;overflow:auto;margin:6px 0">{gantt(nodes).svg}</div>'
-    return texts.view(title, chart, tree_html(nodes))
+    return texts.view(title, chart, tree_html(nodes, pictures))
 
 
 # === tree view ================================================================================================
@@ -147,12 +152,33 @@ def root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     return [each for each in nodes if each.status in texts.FAILED and each.id not in caused]
 
 
-def tree_html(nodes: Sequence[NodeSummary]) -> str:
-    """Return the nodes as indented lines; `nodes` lists each parent before its children, as `TaskTree` does."""
+def tree_html(nodes: Sequence[NodeSummary], pictures: Sequence[ObservedPicture] = ()) -> str:
+    """Return the nodes as indented lines; `nodes` lists each parent before its children, as `TaskTree` does.
+
+    What a node observed is below its line.
+    """
     shown = shown_nodes(nodes)
-    lines = "\n".join(f"{'  ' * each.depth}{_line(each)}" for each in shown)
+    seen: dict[int | None, list[ObservedPicture]] = {}
+    for each in pictures:
+        seen.setdefault(each.node, []).append(each)
+    rows = [(each.depth, row) for each in shown for row in (_line(each), *pictures_row(seen.get(each.id, ())))]
+    lines = "\n".join(f"{'  ' * depth}{row}" for depth, row in rows)
     more = f"<div>{texts.left_out(len(nodes) - len(shown), 'nodes')}</div>" if len(nodes) > len(shown) else ""
     return f'<div style="font-family:monospace;white-space:pre;overflow-x:auto">{lines}</div>{more}'
+
+
+def pictures_row(pictures: Sequence[ObservedPicture]) -> list[str]:
+    """Return one row with these pictures, or none without any."""
+    return ["".join(f"  {_picture(each)}" for each in pictures)] if pictures else []
+
+
+def _picture(picture: ObservedPicture) -> str:
+    caption = f"{texts.recorded(picture.name, 20)} {texts.quiet(f'e{picture.sequence}')}"
+    if not picture.address:
+        return f"{caption}: {texts.recorded(picture.text)}"
+    hint = html.escape(texts.one_line(f"{picture.name} at event {picture.sequence} {picture.text}", 200))
+    image = f'<img src="{picture.address}" alt="{hint}" title="{hint}" style="height:90px;max-width:100%">'
+    return f'<span style="display:inline-block;vertical-align:top">{image}<br>{caption}</span>'
 
 
 def _line(node: NodeSummary) -> str:
@@ -393,12 +419,12 @@ def moment_html(then: Moment) -> str:
     running = " → ".join(f"<b>{texts.recorded(each.dtype or each.kind)}</b>" for each in then.running)
     seen = list(then.observations.items())
     rows = [
-        (texts.recorded(name), texts.recorded(_json(each.values)), f"e{each.sequence}")
+        (texts.recorded(name, 40), texts.recorded(_json(each.values)), f"e{each.sequence}")
         for name, each in seen[:_ROWS_MAX]
     ]
     observed = [texts.table(("observation", "values", "event"), rows), _omitted(len(seen))] if seen else []
     doing = f"<div>{running or texts.quiet('nothing was running')}</div>"
-    return texts.view(title, doing, _objects(then.world), *observed, tree_html(then.tree))
+    return texts.view(title, doing, _objects(then.world), *observed, *pictures_row(then.pictures), tree_html(then.tree))
 
 
 def world_html(world: WorldThen) -> str:

@@ -7,23 +7,30 @@ references, `kind_of` says what a content can be shown as, and the others read i
 
 from __future__ import annotations
 
+import asyncio
 import io
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping
+from base64 import b64encode
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.events.types import BLOB_KEY
+from pycrorm_async.errors import PycrormError
+from pycrorm_async.events.types import BLOB_KEY, Observed
+from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.record.camera import image_type as image_type
 from pycrorm_async.record.values import NPY
+from pycrorm_async.store.log import EventLog
 
 Kind = Literal["image", "depth", "points"]
 
 _PCD_TYPES: Final = ("application/pcd", "application/x-pcd", "model/pcd", "text/x-pcd", "image/x-pcd")
+_SMALL_BYTES: Final = 12_000
+"""An encoded image of at most so many bytes is its own thumbnail."""
 _ITEMS_MAX: Final = 8
 """Bounds the numbers of a list that have curves: as many as a wrench, a quaternion or the joints of an arm have."""
 _SIDE_LEAST: Final = 8
@@ -203,6 +210,97 @@ def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"it cannot be decoded: {error}") from None
     return file.getvalue()
+
+
+PICTURES_MAX: Final = 24
+"""Bounds the pictures of a task tree or a moment, which a notebook keeps with the cell."""
+_PICTURE_SIDE: Final = 160
+_PICTURED_BYTES_MAX: Final = 64_000_000
+
+
+class ObservedPicture(NamedTuple):
+    """A picture of what was observed.
+
+    Attributes:
+        node, sequence: the id of the node that observed it, and the event.
+        name: of the observation, and the path in it.
+        address: of a `data:` URL with the picture; empty if there is none.
+        text: the range of a depth map; without an address, the reason.
+    """
+
+    node: int | None
+    sequence: int
+    name: str
+    address: str
+    text: str
+
+
+def picture_of(content: Content, data: bytes, side: int, room: int = 0) -> tuple[str, int, str]:
+    """Return a `data:` URL with a picture of a content, its size in bytes, and a text about it.
+
+    It is whole if it takes at most `room` bytes, or is a small file; else its longer side has at most `side` pixels.
+    The text is `whole`, or the range of a depth map, or both. Raises `ValueError` with the reason if there is none.
+    """
+    if content.media_type.startswith("image/"):
+        media_type, text = image_type(data), ""
+        if len(data) <= max(_SMALL_BYTES, room):
+            made, text = data, "whole"
+        else:
+            media_type, made = "image/jpeg", _small_jpeg(data, side)
+    else:
+        array = array_of(data)
+        is_depth = _kind_of(array.shape, str(array.dtype)) == "depth"
+        pixels = pixels_of(content, data)
+        low, high = range_of(array)
+        text = f"{low:.4g} to {high:.4g}" if is_depth else ""
+        if pixels.nbytes <= room:
+            media_type, made = "image/png", png_of(pixels)
+            text = ", ".join(filter(None, ("whole", text)))
+        elif is_depth:
+            media_type, made = "image/png", png_of(smaller(pixels, side // 2))
+        else:
+            media_type, made = "image/jpeg", _small_jpeg(pixels, side)
+    return f"data:{media_type};base64,{b64encode(made).decode()}", len(made), text
+
+
+def _small_jpeg(image: bytes | NDArray[np.uint8], side: int) -> bytes:
+    try:
+        return jpeg_of(image, side)
+    except ImportError:
+        raise ValueError("a smaller one needs Pillow: pip install 'pycrorm-async[pictures]'") from None
+
+
+async def _picture(log: EventLog, content: Content) -> tuple[str, str]:
+    """Return address and text of a picture of a content."""
+    try:
+        with log.translated():
+            data = await log.blobs.read_blob(content.hash) if content.size <= _PICTURED_BYTES_MAX else None
+        if data is None:
+            raise ValueError(f"its {content.size:,} bytes are not in the log, or too many for a notebook")  # noqa: TRY301
+        address, _, text = await asyncio.to_thread(picture_of, content, data, _PICTURE_SIDE)
+    except ValueError as reason:
+        return "", str(reason)
+    return address, text
+
+
+async def read_pictures(
+    log: EventLog, episode: int, observed: Sequence[tuple[str, int, int | None]]
+) -> tuple[ObservedPicture, ...]:
+    """Return pictures of observations of an episode, given by name, event and node; of many every n-th of each name."""
+    pictures: list[ObservedPicture] = []
+    chosen = sorted(observed, key=lambda each: each[:2])[:: -(-len(observed) // PICTURES_MAX) or 1]
+    for name, sequence, node in sorted(chosen, key=lambda each: each[1]):
+        for stored in await log.events(episode, after=sequence - 1, limit=1):
+            try:
+                happening = happening_of(stored)
+            except PycrormError as fault:
+                pictures.append(ObservedPicture(node, sequence, name, "", str(fault)))
+                continue
+            for each in contents_in(happening.values) if isinstance(happening, Observed) else ():
+                if each.kind in ("image", "depth") and len(pictures) < PICTURES_MAX:
+                    shown = await _picture(log, each)
+                    pictures.append(ObservedPicture(node, sequence, f"{name} {each.path}".rstrip(), *shown))
+    return tuple(pictures)
 
 
 # === point clouds =============================================================================================

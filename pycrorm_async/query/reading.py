@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import html
 import re
+import sys
 import threading
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, aclosing, asynccontextmanager
 from contextvars import ContextVar
@@ -61,10 +62,17 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+    from pycrorm_async.query.observed_images import ObservedPicture
+
 _ABSENT = re.compile(
     r'no such (?:table|column): (?:main\.)?"?(\w+)|relation "(\w+)" does not exist|column "?(\w+)"?\.\S+ does not exist'
 )
 """The messages of SQLite and PostgreSQL about what does not exist, with the name of the table."""
+
+
+def _draws(images: bool | None) -> bool:  # noqa: FBT001  a choice that may be left to the program
+    """Return whether pictures are read: as asked, or in a notebook."""
+    return "ipykernel" in sys.modules if images is None else images
 
 
 class Reading:
@@ -321,10 +329,12 @@ class Reading:
             async with self._connection(simulated=True) as connection:
                 return await named_queries.episode_named(connection, name)
 
-    async def tree(self, episode: AskedEpisode) -> TaskTree:
+    async def tree(self, episode: AskedEpisode, *, images: bool | None = None) -> TaskTree:
         """Return the task tree of an episode, simulations included, as a list: each node comes before its children.
 
-        A notebook draws it. Raises `UnknownEpisode` for a name that no episode has; for an unknown number it is empty.
+        A notebook draws it. `images` reads at most 24 pictures of what the nodes observed, evenly over the episode; by
+        default in a notebook only. Raises `UnknownEpisode` for a name that no episode has; for an unknown number it is
+        empty.
         """
         await self._ready()
         with self._log.translated():
@@ -335,8 +345,12 @@ class Reading:
                     summary = episode
                 else:
                     summary = await named_queries.episode_named(connection, str(episode))
-                nodes = await named_queries.task_tree(connection, summary.number) if summary is not None else []
-                return TaskTree(nodes, summary)
+                if summary is None:
+                    return TaskTree()
+                tree = TaskTree(await named_queries.task_tree(connection, summary.number), summary)
+                seen = await named_queries.observed_contents(connection, summary.number) if _draws(images) else []
+            tree.pictures = await self._pictures(summary.number, seen)
+            return tree
 
     async def as_of(
         self,
@@ -345,6 +359,7 @@ class Reading:
         time: float | datetime | None = None,
         sequence: int | None = None,
         meshes: bool = False,
+        images: bool | None = None,
     ) -> Moment:
         """Return the task tree and the world of an episode at any moment, read from the log, also while it runs.
 
@@ -355,13 +370,25 @@ class Reading:
                 which includes the events before the first later one.
             sequence: of the last event to include.
             meshes: read the mesh files of the objects too, which `Settings(record_meshes="files")` records.
+            images: read pictures of what had been observed last, for a notebook; by default in a notebook only.
 
         A moment beyond the last event in the log gives the state after that event. Raises `UnknownEpisode`;
         `CallerError` for a moment before the start, or without exactly one of `time` and `sequence`; `LogDamaged` or
         `DatabaseForeign` for an event that cannot be read.
         """
         await self._ready()
-        return await as_of(self._log, episode, time=time, sequence=sequence, meshes=meshes)
+        then = await as_of(self._log, episode, time=time, sequence=sequence, meshes=meshes)
+        if not _draws(images):
+            return then
+        seen = [(name, each.sequence, each.node) for name, each in then.observations.items()]
+        return replace(then, pictures=await self._pictures(then.number, seen))
+
+    async def _pictures(self, number: int, seen: Sequence[tuple[str, int, int | None]]) -> tuple[ObservedPicture, ...]:
+        if not seen:
+            return ()
+        from pycrorm_async.query.observed_images import read_pictures  # here, because it loads numpy
+
+        return await read_pictures(self._log, number, seen)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, as hexadecimal digits; None if it is not stored."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from pycrorm_async import world
 from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
@@ -35,6 +35,9 @@ from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.visible_text import visible
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.observed_images import ObservedPicture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +182,7 @@ class Moment(NotebookValue):
         observations: by name, the latest observation of a program.
         percepts, places: the latest 100 percepts and searches for a place up to that moment, in the order of events.
         tags: of the episode at that moment.
+        pictures: of the observations, which a notebook draws; empty unless they were asked for.
     """
 
     number: int
@@ -197,6 +201,7 @@ class Moment(NotebookValue):
     tags: tuple[str, ...] = ()
     percepts: tuple[Percept, ...] = ()
     places: tuple[PlaceSearch, ...] = ()
+    pictures: tuple[ObservedPicture, ...] = field(default=(), repr=False)
 
     @property
     def running(self) -> tuple[NodeThen, ...]:

@@ -25,8 +25,6 @@ _SHOWN_MAX: Final = {"image": 200, "points": 20}
 _FEW: Final = 40
 _SIDE_OF_FEW, _SIDE_OF_MANY = 320, 192
 """The longer side of a thumbnail, in pixels, on a page with few of them and with many."""
-_SMALL_BYTES: Final = 12_000
-"""An encoded image of at most so many bytes is its own thumbnail."""
 _BYTES_MAX: Final[Mapping[Images, int]] = {"none": 0, "thumbs": 4_500_000, "full": 24_000_000}
 """Bounds the bytes of all pictures of a page; in base64 they take a third more."""
 _POINTS_MAX: Final = 8_000
@@ -115,26 +113,7 @@ class _Maker:
         self.contents.append(made)
 
     def _picture(self, content: Content, data: bytes) -> tuple[str, int, str]:
-        """Return a picture as an address that holds it, its size in bytes, and what the page says about it."""
-        if content.media_type.startswith("image/"):
-            media_type, text = observed_images.image_type(data), ""
-            if len(data) <= _SMALL_BYTES or (self._images == "full" and len(data) <= self._left):
-                made, text = data, "whole"
-            else:
-                media_type, made = "image/jpeg", _jpeg(data, self._side)
-        else:
-            array = observed_images.array_of(data)
-            pixels = observed_images.pixels_of(content, data)
-            low, high = observed_images.range_of(array)
-            text = f"{low:.4g} to {high:.4g}" if content.kind == "depth" else ""
-            if self._images == "full" and pixels.nbytes <= self._left:
-                media_type, made = "image/png", observed_images.png_of(pixels)
-                text = ", ".join(filter(None, ("whole", text)))
-            elif content.kind == "depth":
-                media_type, made = "image/png", observed_images.png_of(observed_images.smaller(pixels, self._side // 2))
-            else:
-                media_type, made = "image/jpeg", _jpeg(pixels, self._side)
-        return f"data:{media_type};base64,{b64encode(made).decode()}", len(made), text
+        return observed_images.picture_of(content, data, self._side, self._left if self._images == "full" else 0)
 
     def _cloud(self, content: Content, data: bytes) -> tuple[dict[str, Any], int, str]:
         """Return a cloud as the ends of its box and 16 bits for each coordinate, its size, and the number of points."""
@@ -146,10 +125,3 @@ class _Maker:
         scaled = ((drawn - low) / np.where(high > low, high - low, 1) * 65_535).round().astype("<u2").tobytes()
         ends = {"low": low.astype(float).round(4).tolist(), "high": high.astype(float).round(4).tolist()}
         return {**ends, "points": b64encode(scaled).decode()}, len(scaled), f"{len(points):,} points"
-
-
-def _jpeg(image: Any, side: int) -> bytes:
-    try:
-        return observed_images.jpeg_of(image, side)
-    except ImportError:
-        raise ValueError("a smaller one needs Pillow: pip install 'pycrorm-async[pictures]'") from None

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from pycrorm_async import Memory
+from pycrorm_async import Blob, Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.query.episode_diff import Difference, EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.notebook import Episodes, TaskTree
 from pycrorm_async.query.notebook_html import cases_html
+from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.reading import memory_html
 from pycrorm_async.query.running_episodes import RobotSummary
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen
@@ -24,11 +27,14 @@ from pycrorm_async.query.sql import SqlResult
 from pycrorm_async.query.text import NotebookValue, value_html
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from tests.databases import put_memory
 
 START = datetime(2026, 3, 1, 12, tzinfo=UTC)
 HOSTILE = "</details></script><script>alert(1)</script>\u202e\"'& <img src=x onerror=alert(1)>"
-ELEMENTS = set("div span b bdi details summary table thead tbody tr th td svg g title rect path text polygon".split())
-ATTRIBUTES = set("style open title scope role aria-label xmlns viewbox d x y width height rx points".split())
+ELEMENTS = set(
+    "div span br img b bdi details summary table thead tbody tr th td svg g title rect path text polygon".split()
+)
+ATTRIBUTES = set("alt src style open title scope role aria-label xmlns viewbox d x y width height rx points".split())
 ATTRIBUTES |= set("fill fill-opacity stroke stroke-width stroke-opacity stroke-dasharray opacity".split())
 ATTRIBUTES |= set("font-family font-size text-anchor paint-order".split())
 
@@ -75,7 +81,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, dict(attributes)))
-        self._open.append(tag)
+        if tag not in ("img", "br"):
+            self._open.append(tag)
 
     def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, dict(attributes)))
@@ -97,6 +104,7 @@ def harmless(view: str) -> Page:
     assert {name for _, attributes in page.elements for name in attributes} <= ATTRIBUTES
     for _, attributes in page.elements:
         assert not re.search(r"url\(|import|expression", attributes.get("style") or "")
+        assert re.match(r"data:image/(png|jpeg);base64,[\w+/=]+$", attributes.get("src") or "data:image/png;base64,0")
     return page
 
 
@@ -279,3 +287,34 @@ def test_a_database_that_cannot_be_read_is_one_line_without_its_password(tmp_pat
     assert "gone.db" in harmless(memory_html(gone, gone)).text
     server = DatabaseAddress.parse("postgresql://ada:secret@localhost:1/memory")
     assert "secret" not in memory_html(server, server)
+
+
+# === pictures =================================================================================================
+
+
+async def test_what_a_node_observed_is_drawn_below_its_line_and_at_a_moment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    png = png_of(np.zeros((20, 30, 3), np.uint8))
+    with Memory.sync(url) as writing:
+        look = writing.recording.type("action", "LookAction", {})
+        with writing.recording.episode(description="what it saw") as episode:
+            for number in range(40):
+                episode.start(number, look)
+                episode.observe(HOSTILE, {"rgb": Blob(png, "image/png"), "depth": np.eye(40)}, node=number)
+                episode.observe("no image", Blob(b"none", "image/png"), node=number)
+                episode.end(number)
+    async with Memory.open(url) as memory:
+        assert (await memory.tree("last")).pictures == ()
+        monkeypatch.setitem(sys.modules, "ipykernel", sys)  # as in a notebook
+        tree = await memory.tree("last")
+        then = await memory.as_of("last", sequence=5)
+    assert (len(tree.pictures), len(then.pictures)) == (24, 3)
+    assert sum(each.name == "no image" for each in tree.pictures) == 8  # of each camera its share
+    page = harmless(tree._repr_html_())
+    assert page.count("img") == 16
+    lines = page.text.split("\n")
+    first = next(index for index, each in enumerate(lines) if "it is no PNG, JPEG, GIF or WebP image" in each)
+    assert "LookAction" in lines[first - 1]
+    assert harmless(then._repr_html_()).count("img") == 2
