@@ -109,7 +109,7 @@ def test_plain_samples_are_those_of_the_policy_and_the_generator_is_the_callers(
     got = list(action.plain())
     assert [(each.arm, each.grasp) for each in got] == [each[:2] for each in drawn]
     for each, choice in zip(got, drawn, strict=True):
-        assert seen_from_object(stage.target.pose, each.standing_position) == pytest.approx(choice[2:])
+        assert seen_from_object(stage.target.pose, each.standing_position) == pytest.approx(choice[2:4])
     assert (np.random.get_state()[1] == before).all()  # type: ignore[index]
 
 
