@@ -28,9 +28,9 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import AsyncIterable, AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterable, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager
+from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, contextmanager
 from contextvars import copy_context
 from dataclasses import replace
 from functools import partial, wraps
@@ -44,6 +44,7 @@ from pycrorm_async import projections as folding
 from pycrorm_async import query as reading_side
 from pycrorm_async import report as reporting
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign, TablesPending
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.fields import checked_tags
@@ -70,11 +71,12 @@ if TYPE_CHECKING:
     from pycrorm_async.export.lerobot import ImageSize
     from pycrorm_async.export.scenes import Clock as StateClock
     from pycrorm_async.export.selection import Exportable
+    from pycrorm_async.plan.language import ActionDescription, Designator
     from pycrorm_async.plan.task import TaskTreeNode
     from pycrorm_async.projections import Projection, UserView
     from pycrorm_async.query import Ask, AskedEpisode, Question, Reading, SyncQuestion
     from pycrorm_async.query.picture import MomentReference
-    from pycrorm_async.recall import Answer, Recall
+    from pycrorm_async.recall import Answer, Prediction, Recall
     from pycrorm_async.record import Episode
     from pycrorm_async.record.camera import CameraStream
     from pycrorm_async.report import Report
@@ -490,6 +492,51 @@ class Memory:
         """The past actions most like a cue: `await memory.recall(type=PickUpAction, has={"arm": Arms.LEFT})`."""
         return self._open_parts.recall
 
+    async def predict(
+        self, /, action: ActionDescription[Any] | Designator | str | type, **situation: Mapping[str, Any]
+    ) -> Prediction:
+        """Predict the outcome of an action from the remembered tries most like it; see `Recall.predict`.
+
+        >>> prediction = await memory.predict(PickUpAction(milk, [Arms.LEFT], [Grasp.FRONT]))
+        >>> print(prediction)
+        82 % (61-93 %) from 14.2 tries like it; if it fails, most likely by IKError
+        """
+        return await self.recall.predict(action, **situation)
+
+    @contextmanager
+    def advising(self, minimum: float = 0.3, *, explore: bool = True) -> Iterator[None]:
+        """Advise the plans of this context: they try the alternatives that are likeliest to succeed first.
+
+        >>> with memory.advising(minimum=0.3):
+        ...     await Retry(MoveAndPickUp(milk), max_tries=5).perform()
+
+        Each expression that performs a description, such as `Retry`, predicts the outcome of its alternatives, again
+        after each failure. It leaves out those that succeed with less than `minimum`, and raises `RefusedByPrediction`
+        if no other is left. An observation `advice` of its node has the predicted chance and the number of those left
+        out. A plan that chooses itself, by `resolve()` or in a loop, asks `predict`.
+
+        Args:
+            minimum: the least chance with which an alternative is tried, 0 to 1.
+            explore: whether alternatives are tried of which too little is known; False saves failures where much is
+                remembered, and tries nothing where nothing is.
+
+        If the prediction fails or takes more than 5 s, as without the database, the plan goes on unadvised and the log
+        says so once.
+
+        Raises `CallerError` for a minimum that is not from 0 to 1.
+        """
+        if not 0 <= minimum <= 1:
+            raise CallerError(f"minimum must be a chance from 0 to 1, got {minimum!r}")
+        from pycrorm_async.plan.advice import adviser  # here, because most memories advise no plan
+        from pycrorm_async.recall.prediction import MemoryAdviser
+
+        adviser_ = MemoryAdviser(self.recall.predictions, self.observe, minimum, explore=explore)
+        try:
+            with set_inside(adviser, adviser_):
+                yield
+        finally:
+            adviser_.close()
+
     async def report(
         self,
         episode: AskedEpisode,
@@ -813,6 +860,7 @@ class SyncMemory:
         return self._await(self._memory.recall(type, **cue))
 
     synced = _awaited(lambda: Memory.synced)
+    predict = _awaited(lambda: Memory.predict)
     episodes = _awaited(lambda: Memory.episodes)
     tree = _awaited(lambda: Memory.tree)
     as_of = _awaited(lambda: Memory.as_of)

@@ -264,6 +264,36 @@ class SearchingFailed(HighLevelFailure):
     """The search ended without the object."""
 
 
+# --- advice -------------------------------------------------------------------------------------------------
+
+
+class RefusedByPrediction(PlanFailure):
+    """A memory predicts that none of the alternatives succeeds often enough, so none was tried (`Memory.advising`).
+
+    Attributes:
+        alternatives: their number.
+        chance, low, high: of the one that is likeliest to succeed, with the interval, 0 to 1.
+        minimum: the least chance with which an alternative is tried.
+        reason: the failure that is most likely; None if it is not known.
+    """
+
+    def __init__(
+        self, alternatives: int, chance: float, low: float, high: float, minimum: float, reason: str | None
+    ) -> None:
+        expected = f", most likely by {reason}" if reason is not None else ""
+        super().__init__(
+            f"{alternatives} alternatives were refused, because the memory expects them to fail{expected}: the best one"
+            f" succeeds with {chance:.0%} ({low:.0%} to {high:.0%}), less than {minimum:.0%}"
+        )
+        self.args = (alternatives, chance, low, high, minimum, reason)
+        self.alternatives = alternatives
+        self.chance = chance
+        self.low = low
+        self.high = high
+        self.minimum = minimum
+        self.reason = reason
+
+
 # --- tasks --------------------------------------------------------------------------------------------------
 
 

@@ -52,12 +52,14 @@ import math
 import operator
 from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import aclosing
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, NoReturn, Self, TypeAlias, TypeVar
 
 from pycrorm_async.plan import failures as plan_failures
+from pycrorm_async.plan.advice import Adviser, advised, adviser
 from pycrorm_async.plan.execution import Arbiter, ExecutionContext, execution_context, is_wrapped, wrap_perform
 from pycrorm_async.plan.field_types import check_properties, record_arguments
 from pycrorm_async.plan.geometry import lifting_arms
@@ -539,11 +541,21 @@ class Code(Designator):
 
 
 async def perform_operand(operand: Operand) -> Any:
-    """Perform an operand; resolve it first if it is a description."""
-    designator = operand if isinstance(operand, Designator) else operand.resolve()
+    """Perform an operand; resolve it first if it is a description, to its best alternative where plans are advised."""
+    designator: Any = operand
+    if not isinstance(operand, Designator):
+        by = adviser.get()
+        designator = await _best_alternative(operand, by) if by is not None else operand.resolve()
     if inspect.isawaitable(designator):
         designator = await designator
     return await _check_operand(designator, "an expression").perform()
+
+
+async def _best_alternative(description: ActionDescription[Any], by: Adviser) -> Any:
+    async with aclosing(advised(description, by)) as alternatives:
+        async for each in alternatives:
+            return each
+    return description.resolve()  # raises the reason why there is no alternative
 
 
 def name_of(value: Any) -> str:

@@ -25,8 +25,14 @@ from types import TracebackType
 from typing import Any
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.plan.advice import advised, adviser
 from pycrorm_async.plan.execution import Simulation, current_simulation, recorder
-from pycrorm_async.plan.failures import IllPosedGoalFailure, NotALanguageExpression, describe_error
+from pycrorm_async.plan.failures import (
+    IllPosedGoalFailure,
+    NotALanguageExpression,
+    RefusedByPrediction,
+    describe_error,
+)
 from pycrorm_async.plan.language import Composable, Designator, Expression, attempt, combine_failures, perform_operand
 from pycrorm_async.plan.task import CollectedTree, collecting, current_node
 from pycrorm_async.world.bullet import current_world
@@ -61,16 +67,20 @@ class Retry(Expression):
         """Return the result of the first success, or raise the last failure with the earlier ones as notes."""
         failures: list[Exception] = []
         notes: list[str] = []
-        async with aclosing(self._alternatives()) as alternatives:
-            async for performable in alternatives:
-                result, failure = await attempt(functools.partial(perform_operand, performable))
-                if failure is None:
-                    return result
-                failures = [failure]
-                notes.append(f"try {len(notes) + 1}: {describe_error(failure)}")
-                del failure
-                if len(notes) == self.max_tries:
-                    break
+        try:
+            async with aclosing(self._alternatives()) as alternatives:
+                async for performable in alternatives:
+                    result, failure = await attempt(functools.partial(perform_operand, performable))
+                    if failure is None:
+                        return result
+                    failures = [failure]
+                    notes.append(f"try {len(notes) + 1}: {describe_error(failure)}")
+                    del failure
+                    if len(notes) == self.max_tries:
+                        break
+        except RefusedByPrediction as refused:  # of all alternatives that are left
+            failures = [refused]
+            notes.append("")
         if not failures:
             raise IllPosedGoalFailure(f"{self!r}: the description has no alternative")
         for note in notes[:-1]:
@@ -79,7 +89,12 @@ class Retry(Expression):
 
     async def _alternatives(self) -> AsyncGenerator[Any, None]:
         (operand,) = self.operands
-        if isinstance(operand, AsyncIterable):  # a description that asks a memory between two alternatives
+        by = adviser.get()
+        if by is not None and not isinstance(operand, Designator):
+            async with aclosing(advised(operand, by)) as alternatives:
+                async for each in alternatives:
+                    yield each
+        elif isinstance(operand, AsyncIterable):  # a description that asks a memory between two alternatives
             async for each in operand:
                 yield each
         else:

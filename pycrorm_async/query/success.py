@@ -210,7 +210,7 @@ def _places(values: Values, *, seed: int) -> NDArray[Any]:
 # Compute the 95 % interval of a success rate.
 
 
-def interval_95(successes: int, tries: int) -> tuple[float, float]:
+def interval_95(successes: float, tries: float) -> tuple[float, float]:
     """Return the interval by Wilson's score, which also holds for few tries and for rates near 0 and 1.
 
     >>> interval_95(11, 20)

@@ -7,6 +7,7 @@ from pycrorm_async.lazy_names import lazy_names
 if TYPE_CHECKING:
     from pycrorm_async.recall.answer import Answer as Answer
     from pycrorm_async.recall.experience import PickUpExperience as PickUpExperience
+    from pycrorm_async.recall.prediction import Prediction as Prediction
     from pycrorm_async.recall.recall import CaseReader as CaseReader
     from pycrorm_async.recall.recall import DatabaseSource as DatabaseSource
     from pycrorm_async.recall.recall import Recall as Recall
@@ -17,6 +18,7 @@ __getattr__ = lazy_names(
     {
         "answer": "Answer",
         "experience": "PickUpExperience",
+        "prediction": "Prediction",
         "recall": "CaseReader DatabaseSource Recall",
         "running_cases": "ProcessCases",
     },

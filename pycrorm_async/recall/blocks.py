@@ -332,6 +332,8 @@ def _kind(values: NDArray[Any]) -> str:
 # for. Cases are stored as columns in *blocks*, and the cases of one type in a block are a *group* (`blocks.py`). The
 # *spread* of a number is its standard deviation among the cases of a type.
 
+NEAR_M = 0.1
+"""The distance in m, of the base in the object's frame and of the height, at which a past try counts exp(-1/2)."""
 ANGLE_TOLERANCE = 0.5
 """The tolerance in rad of an angle for which the cue has none, about 30 degrees."""
 

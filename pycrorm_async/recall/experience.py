@@ -28,7 +28,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import PickUpAction
 from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.recall.blocks import CaseLibrary, Group
+from pycrorm_async.recall.blocks import NEAR_M, CaseLibrary, Group
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType, Pose, yaw_quaternion
 
@@ -85,8 +85,6 @@ _NUMBERS = frozenset("stand_x stand_y stand_yaw object_z torso height".split())
 
 TRIES_MAX: Final = 2_000
 """Bounds the tries that are compared; the latest are taken."""
-NEAR_M: Final = 0.1
-"""The distance in m, of the base in the object's frame and of the height, at which a try counts exp(-1/2)."""
 _WAYS_MAX: Final = 500
 """Bounds the ways with one arm and grasp that are scored; those that succeeded nearest to the height are taken."""
 _DIGITS: Final = 6

@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from importlib import import_module
+from inspect import isawaitable
 from numbers import Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
@@ -27,28 +28,25 @@ from sqlalchemy import Select, select
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, SLOT_NODE, row_id, row_id_min, row_key
-from pycrorm_async.events.types import DesignatorTypeDeclared, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
-from pycrorm_async.plan.language import Designator
+from pycrorm_async.plan.language import ActionDescription, Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.query.frames import member_of
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall import cases as case_rows
 from pycrorm_async.recall import search
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, merge
 from pycrorm_async.recall.columns import RESERVED, Case
-from pycrorm_async.record.plan_types import built_in_declaration, declared_type
-from pycrorm_async.record.values import pose_value
+from pycrorm_async.recall.prediction import Prediction, Situation, predict, present_situation, situations_of
+from pycrorm_async.recall.search import dtype_of
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.bullet import BulletWorld, Object
-from pycrorm_async.world.world_copy import acting_robot
+from pycrorm_async.world.bullet import Object
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,6 +173,44 @@ class Recall:
         words = search.symbols_of({**symbols, **has}), search.numbers_of({**wanted, **near})
         cue = await make_cue(library, self._reading, dtype, *words, (), Conditions(k=k, **conditions))
         return self._answer(cue, library)
+
+    async def predict(
+        self,
+        action: ActionDescription[Any] | Designator | str | type,
+        *,
+        has: Mapping[str, Any] = _NOTHING,
+        near: Mapping[str, Any] = _NOTHING,
+    ) -> Prediction:
+        """Predict the outcome of an action that would begin now, from the tries most like it (`recall.prediction`).
+
+        Args:
+            action: a designator, or a description, of which the first alternative is predicted; or a type, in the
+                situation that `has` and `near` give.
+            has, near: of a type only, the words that a try must have, and the numbers, as in the call.
+
+        Raises `CallerError` for features that no action of the type has, and for those of a designator.
+        """
+        if not isinstance(action, str | type):
+            if has or near:
+                raise errors.CallerError("`has` and `near` belong to a type; an action has a situation of its own")
+            first: Any = action.resolve() if isinstance(action, ActionDescription) else action
+            return (await self.predictions([await first if isawaitable(first) else first]))[0]
+        dtype = dtype_of(action)
+        if dtype is None:
+            raise errors.CallerError("give the type of the action, as in `predict(PickUpAction)`")
+        library = await self._reader.library(dtype, aliases_of(action))
+        words, numbers = search.symbols_of(has), search.numbers_of(near)
+        search.check_cue(search.Cue(type=dtype, has=words, near=numbers), library)
+        return predict(library, [Situation(dtype, dict(words), numbers)])[0]
+
+    async def predictions(self, actions: Sequence[Designator]) -> list[Prediction]:
+        """Predict the outcome of each of these designators, as if it began now."""
+        situations = situations_of(actions)
+        library = CaseLibrary()
+        for dtype, kind in {each.type: type(action) for each, action in zip(situations, actions, strict=True)}.items():
+            aliases = aliases_of(kind) if kind.__dtype__ == dtype else ()
+            library = await self._reader.library(dtype, aliases)
+        return predict(library, situations)
 
     def _answer(self, cue: search.Cue, library: CaseLibrary) -> Answer:
         search.check_cue(cue, library)
@@ -540,24 +576,6 @@ def cue_like(case: Case, library: CaseLibrary) -> search.Cue:
     )
 
 
-def dtype_of(designator: str | type | None) -> str | None:
-    """Return the type of a designator class, of a mapped class, or by its name.
-
-    >>> dtype_of(PickUpAction), dtype_of("PickUpAction")
-    ('PickUpAction', 'PickUpAction')
-    """
-    if designator is None or isinstance(designator, str):
-        return designator
-    dtype = getattr(designator, "__dtype__", None)
-    if isinstance(dtype, str):
-        return dtype
-    if not isinstance(designator, type):
-        raise errors.CallerError(
-            f"{search.shortened(designator)} is not a type: give a designator class, or the name of one"
-        )
-    return search.word(designator).removeprefix("ORM")
-
-
 def aliases_of(designator: str | type | None) -> tuple[str, ...]:
     """Return the former names that a designator class declares."""
     aliases = getattr(designator, "__aliases__", ())
@@ -714,62 +732,3 @@ class DatabaseSource:
     async def present_names(self) -> Mapping[str, str]:
         """Return the present name of each declared type, by all its names."""
         return await self._reading.present_names()
-
-
-# === present situation ========================================================================================
-#
-# Describe the world as it is, as if an action with an object began now: the features that its case would have.
-
-
-def present_situation(
-    target: Object | ObjectDesignator, action: str | type
-) -> tuple[case_rows.Symbols, case_rows.Numbers]:
-    """Return the features of an action that would start now, without those of parameters other than the object.
-
-    `action` is a designator class, or a built-in type by its description or its dtype.
-
-    Raises `CallerError` for an object that is in no world, and for another class.
-    """
-    body = target.world_object if isinstance(target, ObjectDesignator) else target
-    if not isinstance(body, Object) or body not in body.world.objects:
-        raise errors.CallerError(
-            f"{target!r} is not an object in a world, so it has no situation: add it to a world first"
-        )
-    fields = case_rows.FeatureFields.of(_declaration(action))
-    # Events refer to objects by the sequence that added them: number the objects as an episode that began now would.
-    sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
-    parameters: dict[str, Any] = {}
-    if fields.objects:
-        parameters[fields.objects[0]] = {"object": sequences[body], "row": sequences[body]}
-    return case_rows.situation(fields, parameters, _robot(body.world, sequences), _world(body.world, sequences))
-
-
-def _declaration(action: str | type) -> DesignatorTypeDeclared:
-    if isinstance(action, type) and issubclass(action, Designator):
-        return declared_type(action, strict=False).declaration
-    declaration = built_in_declaration(dtype_of(action) or "")
-    if declaration is None:
-        raise errors.CallerError(f"{action!r} is not a designator class: give one, such as PickUpAction")
-    return declaration
-
-
-def _robot(world: BulletWorld, sequences: Mapping[Object, int]) -> RobotValue | None:
-    robot = acting_robot(world)
-    if robot is None or robot not in sequences:
-        return None
-    torso = robot.robot_description.torso_joint if robot.robot_description is not None else None
-    reference = ObjectReference(sequences[robot], sequences[robot])
-    height = robot.joint_position(torso) if torso is not None else None
-    return RobotValue(pose_value(robot.pose), robot.object_type.name, height, reference, robot.name)
-
-
-def _world(world: BulletWorld, sequences: Mapping[Object, int]) -> ReplayedWorld:
-    replayed = ReplayedWorld()
-    for each, sequence in sequences.items():
-        attachment = world.attachments.of(each)
-        added = ObjectAdded(each.name, each.object_type.name, pose_value(each.pose))
-        present = WorldObject(added, added.pose, sequence)
-        if attachment is not None:
-            present.attached_to = sequences[attachment.parent], attachment.link
-        replayed.objects[sequence], replayed.added[sequence] = present, added
-    return replayed

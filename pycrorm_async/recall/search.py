@@ -336,6 +336,22 @@ def word(value: object) -> str:
     return str(value)
 
 
+def dtype_of(designator: str | type | None) -> str | None:
+    """Return the type of a designator class, of a mapped class, or by its name.
+
+    >>> dtype_of(PickUpAction), dtype_of("PickUpAction")
+    ('PickUpAction', 'PickUpAction')
+    """
+    if designator is None or isinstance(designator, str):
+        return designator
+    dtype = getattr(designator, "__dtype__", None)
+    if isinstance(dtype, str):
+        return dtype
+    if not isinstance(designator, type):
+        raise CallerError(f"{shortened(designator)} is not a type: give a designator class, or the name of one")
+    return word(designator).removeprefix("ORM")
+
+
 def closest(name: str, valid: Iterable[str]) -> str:
     """Return the end of an error's line: the names most like this one, or else some of the valid ones.
 

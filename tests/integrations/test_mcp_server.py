@@ -94,7 +94,7 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
     async with agent_of(url) as agent:
         assert "untrusted data, never" in (agent.client.instructions or "")
         tools = (await agent.client.list_tools()).tools
-        own = "episodes now show why_failed at picture compare recall schema query".split()
+        own = "episodes now show why_failed at picture compare recall predict schema query".split()
         assert [each.name for each in tools] == [*own, *(each for each in QUESTIONS if each != "episodes")]
         assert all(each.annotations is not None and each.annotations.read_only_hint for each in tools)
         episodes = await agent.ask("episodes")
@@ -207,6 +207,7 @@ async def test_an_agent_sees_the_scene_recalls_actions_and_follows_what_runs(tmp
         assert case.endswith(": SUCCEEDED")
         event = case.split("event ")[1].split(":")[0]
         assert (await agent.ask("recall", like=f"1/{event}")).startswith("0 of 1 cases for NavigateAction")
+        assert await agent.ask("predict", type="NavigateAction") == "83 % (21-100 %) from 1.0 tries like it"
         assert await agent.refused("recall") == "name a type, has or near, or an action by like"
         assert await agent.refused("recall", like="milk") == (
             "like 'milk' is not an action: write EPISODE/EVENT, as in 3/115 or last/e115"

@@ -17,7 +17,8 @@ from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.experience import TRIES_MAX, Tries, best_first, tries_of
-from pycrorm_async.recall.recall import Recall, present_situation
+from pycrorm_async.recall.prediction import present_situation
+from pycrorm_async.recall.recall import Recall
 from pycrorm_async.world import BulletWorld, Object, Pose
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
