@@ -256,6 +256,10 @@ def a_recalled_way_succeeds(reader: PageReader) -> None:
     assert ask(reader.folder / "tries.db", question) == [("recall",)]
 
 
+def an_advised_plan_notes_the_chance_of_what_it_tries(reader: PageReader) -> None:
+    assert ask(reader.folder / "tries.db", "SELECT count(*) > 0 FROM observation WHERE name = 'advice'") == [(1,)]
+
+
 def the_origins_of_the_policy_are_known(reader: PageReader) -> None:
     reader.cell("""
 from pycrorm_async.learning import name_of
@@ -292,6 +296,7 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
     "pycrorm_async/learning/README.md": {
         "Learning from recorded episodes": a_policy_is_learned_from_the_recorded_rollouts,
         "Repeat what worked": a_recalled_way_succeeds,
+        "Ask before acting": an_advised_plan_notes_the_chance_of_what_it_tries,
         "From which episodes a policy was learned": the_origins_of_the_policy_are_known,
     },
     "pycrorm_async/operations/README.md": {
