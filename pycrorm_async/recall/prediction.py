@@ -221,7 +221,8 @@ def _reason(tries: Group, likeness: NDArray[np.float64]) -> str | None:
 def situations_of(actions: Sequence[Designator]) -> list[Situation]:
     """Return the situation of each action, as if it began now.
 
-    A `MoveAndPickUpPerformable` is compared as the pick-up that it makes at its place, with all tries of pick-ups.
+    A `MoveAndPickUpPerformable` is compared as the pick-up that it makes at its place, with all tries of pick-ups; its
+    `torso`, if it has one, is the height to which it lifts the torso.
     """
     world = current_world.get()
     sequences = _sequences(world) if world is not None else {}
@@ -229,11 +230,14 @@ def situations_of(actions: Sequence[Designator]) -> list[Situation]:
     types: dict[type[Designator], tuple[Sequence[Field], case_rows.FeatureFields]] = {}
     situations = []
     for each in actions:
-        action, place = each, None
+        action, place, torso = each, None, None
         if isinstance(each, MoveAndPickUpPerformable):
             target, height_m = pose_of(each.object_designator), each.standing_position.position.z
             place = face(each.standing_position, target, height_m=height_m)
-            action = PickUpActionPerformable(each.object_designator, each.arm, each.grasp)
+            action, torso = (
+                PickUpActionPerformable(each.object_designator, each.arm, each.grasp),
+                vars(each).get("torso"),
+            )
         if type(action) not in types:
             declared = declared_type(type(action), strict=False)
             types[type(action)] = declared.fields, case_rows.FeatureFields.of(declared.declaration)
@@ -242,7 +246,7 @@ def situations_of(actions: Sequence[Designator]) -> list[Situation]:
         parameters = read_parameters(action, readers, rows, missing)
         # As the event of its start has them.
         recorded = msgspec.json.decode(msgspec.json.encode({k: v for k, v in parameters.items() if k not in missing}))
-        robot = _robot(world, sequences, place) if world is not None else None
+        robot = _robot(world, sequences, place, torso) if world is not None else None
         situations.append(compared(fields.dtype, *case_rows.situation(fields, recorded, robot, replayed), fields))
     return situations
 
@@ -309,14 +313,16 @@ def _sequences(world: BulletWorld) -> Mapping[Object, int]:
     return {each: number for number, each in enumerate(world.objects, 1)}
 
 
-def _robot(world: BulletWorld, sequences: Mapping[Object, int], place: Pose | None = None) -> RobotValue | None:
-    """Return the state of the acting robot; as if it stood at `place`, if that is set."""
+def _robot(
+    world: BulletWorld, sequences: Mapping[Object, int], place: Pose | None = None, torso: float | None = None
+) -> RobotValue | None:
+    """Return the state of the acting robot; as if it stood at `place` and had lifted its torso, if these are set."""
     robot = acting_robot(world)
     if robot is None or robot not in sequences:
         return None
-    torso = robot.robot_description.torso_joint if robot.robot_description is not None else None
+    joint = robot.robot_description.torso_joint if robot.robot_description is not None else None
     reference = ObjectReference(sequences[robot], sequences[robot])
-    height = robot.joint_position(torso) if torso is not None else None
+    height = robot.joint_position(joint) if joint is not None and torso is None else torso
     return RobotValue(pose_value(place or robot.pose), robot.object_type.name, height, reference, robot.name)
 
 

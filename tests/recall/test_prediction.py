@@ -17,6 +17,7 @@ from bench import advised
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_id
+from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable
 from pycrorm_async.orm import Observation, ObservationValue, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, ActionDescription, PlanFailure, Retry, collected_tree, simulated_robot
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable, NavigateActionPerformable, PickUpAction
@@ -126,6 +127,10 @@ async def test_an_action_is_predicted_by_the_tries_in_its_present_situation(data
             assert unlikely.reason == "IKError"
             assert unlikely.chance < 0.3 < likely.chance
             assert not (await memory.predict(PickUpAction(milk, [Arms.RIGHT], [Grasp.FRONT]))).is_known
+            lifted = PredictedPickUpPerformable(
+                move.standing_position, milk, Arms.LEFT, Grasp.FRONT, torso=0.3, relative_x=0, relative_y=0, height=0
+            )
+            assert (await memory.predict(lifted)).tries == pytest.approx(math.exp(-9 / 2), abs=1e-3)  # 3 tolerances
         await memory.flush()
         by_features = await memory.recall.predict(PickUpAction, has={"arm": Arms.LEFT}, near={"stand_x": (-0.7, 0.1)})
         assert by_features.tries == pytest.approx(1, abs=1e-3)
