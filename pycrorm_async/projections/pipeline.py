@@ -519,13 +519,14 @@ def folded(place: str) -> str:
     return f"SELECT id AS number, folded FROM {place}"  # noqa: S608
 
 
-async def left(connection: AsyncConnection, place: str) -> int:
-    """Return the number of events in the log that this generation lacks, without those of parked episodes."""
+async def left(connection: AsyncConnection, place: str, share: tuple[int, int] = (0, 1)) -> int:
+    """Return the number of events of a share that this generation lacks, without those of parked episodes."""
     result = await connection.execute(
         text(
             f"SELECT coalesce(sum(head - coalesce(progress.folded, 0)), 0) FROM episode LEFT JOIN {place} AS progress"  # noqa: S608
-            " ON progress.id = number WHERE progress.parked IS NULL"
-        )
+            " ON progress.id = number WHERE progress.parked IS NULL AND number % :many = :part"
+        ),
+        {"part": share[0], "many": share[1]},
     )
     return int(result.scalar_one())
 

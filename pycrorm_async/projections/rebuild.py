@@ -174,10 +174,10 @@ class Rebuild:
             raise InternalError(f"{log.address}: no rebuild is running that this worker could join")
         return cls(log, making, share=share)
 
-    async def left(self) -> int:
+    async def left(self, share: pipeline.Share = pipeline.WHOLE) -> int:
         """Return the number of events in the log that the new tables lack, without those of parked episodes."""
         async with self._log.reading() as connection:
-            return await pipeline.left(connection, self._place)
+            return await pipeline.left(connection, self._place, share)
 
     async def parked(self) -> dict[int, str]:
         """Return the parked episodes by number, with the reasons."""
