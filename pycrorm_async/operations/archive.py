@@ -3,13 +3,14 @@
 Theory of operation. Of each episode the events that the lake lacks are added in one transaction of the lake, with the
 types, descriptions and blobs that they name. Then its events are read back, and their digest is compared with that of
 the memory. Only then is the episode removed from the memory (`operations.removal`). A process that is killed between
-the two leaves the episode in both, and the next archive finds it in the lake and removes it.
+the two leaves the episode in both, and the next archive finds it in the lake and removes it. One that is killed before
+the commit leaves files that the catalog does not know; an hour later the next archive or erasure deletes them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import DamageError, DatabaseError
@@ -63,6 +64,7 @@ async def archive_episodes(
                     await _archive(log, lake, some, reason, summary)
                     done += sum(each.head for each in some)
                     report_progress(done, total)
+                lake.clear_orphans()
             finally:
                 await lake.close()
             if summary.removed and log.address.is_sqlite:
@@ -91,13 +93,17 @@ def _parts(rows: Sequence[EpisodeRow]) -> Iterator[list[EpisodeRow]]:
 
 
 async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason: str, summary: ArchiveSummary) -> None:
-    there = lake.episode_rows([each.id for each in rows])
+    there, erased = lake.episode_rows([each.id for each in rows]), lake.erased([each.id for each in rows])
     kept = await log.last_digests(rows[0].number, rows[-1].number)
     new: list[tuple[LakeEpisode, Sequence[StoredEvent]]] = []
     elsewhere = {each.id: each.archived_in for each in await log.restored(each.id for each in rows)}
     for row in rows:
         if elsewhere.get(row.id, lake.address) != lake.address:
             summary.stayed[row.id] = f"it was restored from {elsewhere[row.id]}, which has it still: archive it there"
+            continue
+        if row.id in erased:
+            when = f"{datetime.fromtimestamp(erased[row.id] / 1e9, UTC):%Y-%m-%d}"
+            summary.stayed[row.id] = f"it was erased from the lake on {when}: `pycrorm erase` removes it here too"
             continue
         try:
             events = await _events(log, row)

@@ -95,8 +95,10 @@ async def erase(
     archived = [each for each in rows if isinstance(each, RemovedEpisode) and each.archived_in is not None]
     for each in [*archived, *await log.restored(each.id for each in rows)]:
         lakes.setdefault(each.archived_in or "", []).append(each.id)
+    left: list[str] = []
     for address, ids in lakes.items():
-        erase_in_lake(address, ids)
+        again = f"of an archive that runs or was killed: run it again in an hour, with --lake {address}"
+        left += [f"{each}, {again}" for each in erase_in_lake(address, ids)]
     if archived:
         async with log.writing() as connection:
             now_ns = SYSTEM_CLOCK.wall_ns()
@@ -106,7 +108,6 @@ async def erase(
             ]
             await dialect_of(connection).execute(connection, schema.UPSERT_REMOVED, removed=changed)
     there = [each for each in rows if isinstance(each, EpisodeRow)]
-    left: list[str] = []
     for first in range(0, len(there), EPISODES_AT_ONCE):
         await remove(log, there[first : first + EPISODES_AT_ONCE], reason=reason)
     numbers = [each.number for each in rows]

@@ -4,15 +4,19 @@
     ducklake:postgresql://user@host/catalog#/nfs/lake       a catalog on a server; the folder, needed once, behind #
 
 Several memories share one lake: an episode has its UUID as the key, an event the UUID and its sequence. Any DuckDB
-reads the tables `episode`, `event`, `declaration` and `blob`. The catalog keeps the least and the greatest value of a
-column, of texts too, so those of payloads are cleared: otherwise they would outlive an erased episode.
+reads the tables `episode`, `event`, `declaration` and `blob`; `erased` has the ids of episodes that the lake takes from
+no memory any more. The catalog keeps the least and the greatest value of a column, of texts too, so those of payloads
+are cleared: otherwise they would outlive an erased episode.
 """
 
 # ruff: noqa: S608 - the SQL is composed of names and of paths that the caller gave
 
 from __future__ import annotations
 
+import logging
+import math
 import sqlite3
+import time
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from hashlib import sha256
@@ -20,6 +24,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
@@ -28,10 +33,13 @@ from pycrorm_async.errors import (
     QueryRefused,
     UnknownEpisode,
 )
+from pycrorm_async.events.ids import SEQUENCE_MAX
 from pycrorm_async.events.types import references_in
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent
+
+_log = logging.getLogger("pycrorm_async")
 
 PREFIX: Final = "ducklake:"
 _FORMAT: Final = 1
@@ -42,7 +50,12 @@ _TABLES: Final = {
     " payload VARCHAR",
     "declaration": "fingerprint VARCHAR, payload VARCHAR",
     "blob": "hash VARCHAR, media_type VARCHAR, content BLOB",
+    "erased": "id UUID, erased_wall_ns BIGINT",
 }
+_LATER: Final = {"erased"}
+"""The tables that lakes made before them lack until a process writes."""
+_ORPHAN_AGE_S: Final = 3600.0
+"""Age from which a file that the catalog does not know is not one of an archive that runs: it commits after seconds."""
 _PAGE_EVENTS: Final = 5_000
 _EPISODES_AT_ONCE: Final = 200
 """The episodes that one query reads."""
@@ -81,6 +94,8 @@ def open_lake(address: str, *, write: bool = False) -> Any:
     try:
         options = ["DATA_INLINING_ROW_LIMIT 0", *([f"DATA_PATH '{_quoted(data)}'"] if data else [])]
         options += [] if write else ["READ_ONLY"]
+        if catalog == "sqlite":
+            _refuse_other_program(address, Path(place))
         connection.execute(f"ATTACH 'ducklake:{catalog}:{_quoted(place)}' AS lake ({', '.join(options)}); USE lake")
         fault = _prepare(connection, write=write)
     except import_module("duckdb").Error as error:
@@ -120,17 +135,33 @@ def _connect(*extensions: str) -> Any:
     return connection
 
 
+def _refuse_other_program(address: str, catalog: Path) -> None:
+    """Raise `DatabaseForeign` for a file that is not the catalog of a lake: DuckLake would write its tables into it."""
+    if not catalog.exists() or not catalog.stat().st_size:
+        return
+    try:
+        with closing(sqlite3.connect(f"{catalog.as_uri()}?mode=ro", uri=True)) as connection:
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+    except sqlite3.DatabaseError as error:
+        raise DatabaseForeign(f"{shown(address)}: {catalog.name} is no catalog of a lake: {error}") from None
+    if tables and "ducklake_metadata" not in tables:
+        raise DatabaseForeign(f"{shown(address)}: {catalog.name} is a database of another program")
+
+
 def _prepare(connection: Any, *, write: bool) -> str | None:
     """Create the tables of a new lake; return the reason why this version cannot use it."""
     present = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
-    if not present and write:
-        connection.execute("BEGIN")
-        for name, columns in _TABLES.items():
-            connection.execute(f"CREATE TABLE {name} ({columns})")
-        connection.execute(f"INSERT INTO pycrorm_lake VALUES ({_FORMAT}); COMMIT")
-        connection.execute("CALL lake.set_option('parquet_compression', 'zstd')")
-    elif not present >= _TABLES.keys():
+    missing = [name for name in _TABLES if name not in present]
+    if not {*missing} <= _LATER and (present or not write):
         return "is a lake of another program"
+    if missing and write:
+        connection.execute("BEGIN")
+        for name in missing:
+            connection.execute(f"CREATE TABLE {name} ({_TABLES[name]})")
+        if not present:
+            connection.execute(f"INSERT INTO pycrorm_lake VALUES ({_FORMAT})")
+        connection.execute("COMMIT")
+        connection.execute("CALL lake.set_option('parquet_compression', 'zstd')")
     [(number,)] = connection.execute("SELECT max(format) FROM pycrorm_lake").fetchall()
     return f"was made by a newer version: its format is {number}, this reads {_FORMAT}" if number > _FORMAT else None
 
@@ -156,6 +187,14 @@ def _first_line(error: Exception, address: str) -> str:
     """Return the first line of an error of DuckDB; that of a server's catalog may repeat its URL."""
     place = _parsed(address)[1]
     return str(error).splitlines()[0].replace(place, "the catalog")
+
+
+def _modified_s(file: Path) -> float:
+    """Return when a file was written, in s since 1970; infinity for one that is gone."""
+    try:
+        return file.stat().st_mtime
+    except FileNotFoundError:
+        return math.inf
 
 
 def _quoted(text: str) -> str:
@@ -267,7 +306,11 @@ class Lake:
         blobs: Mapping[str, tuple[str, bytes]],
         memory: str,
     ) -> None:
-        """Add episodes, each with the events that the lake lacks, and what they refer to, in one transaction."""
+        """Add episodes, each with the events that the lake lacks, and what they refer to, in one transaction.
+
+        Erases those again that another process erased meanwhile: it keeps their ids before it deletes, so that either
+        this check or its deletion comes last.
+        """
         ids = [each.id for each, _ in episodes]
         events = [(each.id, *event[1:]) for each, some in episodes for event in some]
         try:
@@ -282,6 +325,8 @@ class Lake:
             with suppress(DatabaseUnavailable):
                 self.execute("ROLLBACK")
             raise
+        if erased := self.erased(ids):
+            self.erase([*erased])
         self._clear_bounds()
 
     def _insert(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
@@ -297,16 +342,58 @@ class Lake:
             finally:
                 self._connection.unregister("new_rows")
 
+    def erased(self, ids: Collection[str]) -> dict[str, int]:
+        """Return when those of these episodes were erased that the lake takes from no memory any more, by id."""
+        query = "SELECT id::VARCHAR, min(erased_wall_ns) FROM erased WHERE id IN (SELECT unnest(?)::UUID) GROUP BY id"
+        return dict(self.execute(query, [[*ids]]))
+
+    def clear_orphans(self, ids: Collection[str] = ()) -> list[str]:
+        """Delete files that a killed archive left; return those that stay and may have events of these episodes.
+
+        The catalog does not know such a file. If the lake lacks an event in an old one, all stay: the catalog is an
+        earlier one then, restored from a backup, and they may be the only copy.
+        """
+        call = "ducklake_delete_orphaned_files('lake', dry_run => true, cleanup_all => true)"
+        files = [Path(path) for (path,) in self.execute(f"SELECT path FROM {call}")]
+        old = {each for each in files if _modified_s(each) < time.time() - _ORPHAN_AGE_S}
+        heads = {each: self._heads_in(each) for each in files if each.parent.name == "event"}
+        names = {name for each in heads.values() for name in each or ()}
+        there, erased = self.episode_rows(names), self.erased(names)
+        known = {name: row.head for name, row in there.items()} | dict.fromkeys(erased, SEQUENCE_MAX)
+        unknown = [file for file in old for name, head in (heads.get(file) or {}).items() if known.get(name, 0) < head]
+        if unknown:
+            _log.warning(
+                "%s: the catalog does not know %s, whose events the lake lacks: was it restored from a backup?",
+                self.address,
+                unknown[0],
+            )
+            old.clear()
+        for each in old:
+            each.unlink(missing_ok=True)
+        left = heads.keys() - old
+        return [str(each) for each in left if heads[each] is None or not {*ids}.isdisjoint(heads[each] or ())]
+
+    def _heads_in(self, file: Path) -> dict[str, int] | None:
+        """Return the last event of each episode in a file of events; None for one that was not written to its end."""
+        query = f"SELECT episode::VARCHAR, max(sequence) FROM read_parquet('{_quoted(str(file))}') GROUP BY 1"
+        with suppress(DatabaseUnavailable):
+            return dict(self.execute(query))
+        return None
+
     def absent(self, table: str, key: str, names: Collection[str]) -> set[str]:
         """Return those of these keys that a table of the lake lacks."""
         query = f"SELECT DISTINCT {key} FROM {table} WHERE {key} IN (SELECT unnest(?))"
         return {*names} - {name for (name,) in self.execute(query, [[*names]])}
 
-    def erase(self, ids: Sequence[str]) -> None:
-        """Erase episodes: write the files again without them, and delete the old ones.
+    def erase(self, ids: Sequence[str]) -> list[str]:
+        """Erase episodes: write the files again without them, delete the old ones, and keep the ids.
 
-        Does so too where a call that was killed has deleted their rows. Close the lake after an error.
+        Does so too where a call that was killed has deleted their rows. Returns files that still have events of them:
+        those of an archive that runs or was killed a short time ago. Close the lake after an error.
         """
+        now_ns, before = SYSTEM_CLOCK.wall_ns(), self.erased(ids)
+        if new := [(name, now_ns) for name in ids if name not in before]:
+            self._insert("erased", new)
         query = "SELECT type, encode(payload) FROM event WHERE episode IN (SELECT unnest(?)::UUID)"
         referring = self.execute(f"{query} AND contains(payload, '\"$blob\"')", [list(ids)])
         blobs = [each.hash for kind, payload in referring for each in references_in(kind, payload)]
@@ -326,6 +413,7 @@ class Lake:
         ):
             self.execute(f"SELECT count(*) FROM {call}")  # not its rows, whose times Python would convert with pytz
         self._clear_bounds()
+        return self.clear_orphans(ids)
 
     def _clear_bounds(self) -> None:
         catalog, place, _ = _parsed(self._given)
@@ -348,18 +436,22 @@ def digest_after(running: RunningDigest, events: Sequence[StoredEvent]) -> str:
     return ends[-1][1] if ends and ends[-1][0] == running.sequence else running.digest()
 
 
-def erase_in_lake(address: str, ids: Sequence[str]) -> None:
-    """Erase episodes in a lake, which has to be there, also from the free pages of a catalog in a file."""
+def erase_in_lake(address: str, ids: Sequence[str]) -> list[str]:
+    """Erase episodes in a lake, which has to be there, also from the free pages of a catalog in a file.
+
+    Returns files that still have events of them, as `Lake.erase` does.
+    """
     open_lake(address).close()  # makes none: a folder that is not mounted still holds them
     lake = Lake(address, write=True)
     try:
-        lake.erase(ids)
+        left = lake.erase(ids)
     finally:
         lake._connection.close()  # noqa: SLF001 - of this module
     catalog, place, _ = _parsed(address)
     if catalog == "sqlite":
         with closing(sqlite3.connect(place)) as connection:
             connection.execute("VACUUM")
+    return left
 
 
 def query_lake(address: str, sql: str) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:

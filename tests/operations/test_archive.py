@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import sqlite3
+import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -173,7 +175,7 @@ def erase_until(lake: str, episode: str, last: int) -> None:
 
 async def test_an_erasure_that_is_killed_at_any_step_is_finished_by_the_next(tmp_path: Path, lake: str) -> None:
     url = put_memory(tmp_path / "memory.db")
-    for last in (4, 6, 7, 8):
+    for last in (3, 6, 8, 9, 10):
         ids = await recorded(url, "first", SECRET)
         await archived(url, lake)
         process = ForkedProcess(erase_until, lake, ids[1], last)
@@ -182,6 +184,93 @@ async def test_an_erasure_that_is_killed_at_any_step_is_finished_by_the_next(tmp
         files = [str(each) for each in (tmp_path / "lake/data/main/event").iterdir()]
         query = f"SELECT count(*) FROM read_parquet({files}, union_by_name => true) WHERE episode = '{ids[1]}'"
         assert query_lake(lake, query)[1] == [(0,)], last
+
+
+def archive_until_commit(url: str, lake: str) -> None:
+    """Archive, and die when all files are written, before the lake knows them."""
+    execute = Lake.execute
+
+    def die_before_commit(self: Lake, sql: str, parameters: Sequence[object] = ()) -> list[tuple[object, ...]]:
+        if sql == "COMMIT":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return execute(self, sql, parameters)
+
+    Lake.execute = die_before_commit  # type: ignore[method-assign]
+    asyncio.run(archived(url, lake))
+
+
+def parquet_files(lake: str, *, aged: bool = False) -> set[Path]:
+    """Return the files of events of a lake; `aged` makes them two hours old."""
+    files = {*Path(lake.removeprefix("ducklake:"), "data/main/event").glob("*.parquet")}
+    for each in files if aged else ():
+        os.utime(each, (time.time() - 7200,) * 2)
+    return files
+
+
+async def test_files_of_an_archive_that_was_killed_before_its_commit_are_deleted_when_they_are_old(
+    tmp_path: Path, lake: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    [kept] = await recorded(url, "first")
+    await archived(url, lake)
+    [committed] = parquet_files(lake)
+    [identity] = await recorded(url, SECRET)
+    for _ in range(2):
+        assert ForkedProcess(archive_until_commit, url, lake).wait() == -9
+    torn = committed.with_name("ducklake-torn.parquet")
+    torn.write_bytes(b"PAR1" + SECRET.encode())
+    orphans = parquet_files(lake) - {committed}
+    assert len(orphans) == 3
+    [done] = await erased(url, identity, lake=lake)
+    assert sorted(each.partition(", of an archive that runs or was killed")[0] for each in done.left) == sorted(
+        map(str, orphans)
+    )
+    parquet_files(lake, aged=True)
+    assert [each.left for each in await erased(url, identity, lake=lake)] == [()]
+    assert parquet_files(lake).isdisjoint(orphans)
+    assert query_lake(lake, "SELECT DISTINCT episode::VARCHAR FROM event")[1] == [(kept,)]
+
+    again = await recorded(url, "second")
+    assert ForkedProcess(archive_until_commit, url, lake).wait() == -9
+    before = parquet_files(lake, aged=True)
+    await archived(url, lake)
+    assert len(before) == len(parquet_files(lake)) == 2
+    assert len(before & parquet_files(lake)) == 1
+    assert caplog.messages == []
+
+    catalog = tmp_path / "lake/catalog.sqlite"
+    earlier = catalog.read_bytes()  # a backup
+    await recorded(url, "third")
+    await archived(url, lake)
+    catalog.write_bytes(earlier)
+    only_copies = parquet_files(lake, aged=True)
+    await recorded(url, "fourth")
+    await archived(url, lake)
+    assert only_copies < parquet_files(lake)
+    [warning] = caplog.messages
+    assert "was it restored from a backup?" in warning
+    assert len(again) == 1
+
+
+async def test_a_lake_takes_no_episode_again_that_was_erased_from_it(tmp_path: Path, lake: str) -> None:
+    url, other = put_memory(tmp_path / "memory.db"), put_memory(tmp_path / "other.db")
+    [identity] = await recorded(url, SECRET)
+    await copy_episodes(url, other)
+    await archived(url, lake)
+    source = Lake(lake, write=True)
+    row = source.episode_rows([identity])[identity]
+    events = [event async for page in source.pages(row.row) for event in page]
+    await source.close()
+    await erased(url, identity)
+    for _ in range(2):
+        summary = await archived(other, lake)
+        [(name, why)] = summary.stayed.items()
+        assert (summary.removed, name) == ([], identity)
+        assert why.endswith("`pycrorm erase` removes it here too")
+    source = Lake(lake, write=True)
+    source.add([(row, events)], {}, {}, "of a process that had checked before")
+    await source.close()
+    assert query_lake(lake, "SELECT (SELECT count(*) FROM event), (SELECT count(*) FROM episode)")[1] == [(0, 0)]
 
 
 async def test_an_episode_that_differs_from_the_lake_stays_in_the_memory(tmp_path: Path, lake: str) -> None:
@@ -226,12 +315,41 @@ async def test_bad_lakes_are_refused_in_one_line(tmp_path: Path, lake: str) -> N
     assert query_lake(lake, "SELECT now() > TIMESTAMP '2000-01-01'")[1] == [(True,)]
     assert query_lake(lake, "SELECT now()")[1]
     source = Lake(lake, write=True)
+    source.execute("DROP TABLE erased")  # as of a lake that was made before that table
+    await source.close()
+    assert query_lake(lake, "SELECT count(*) FROM episode")[1] == [(1,)]
+    source = Lake(lake, write=True)
+    assert source.erased(["00000000-0000-7000-8000-000000000000"]) == {}
     source.execute("INSERT INTO pycrorm_lake VALUES (99)")
     await source.close()
-    with pytest.raises(DatabaseForeign, match="was made by a newer version: its format is 99"):
-        query_lake(lake, "SELECT 1")
-    with pytest.raises(DatabaseForeign, match="newer version"):
-        await archived(url, lake)
+    for change, fault in (
+        ("", "was made by a newer version: its format is 99"),
+        ("UPDATE ducklake_metadata SET value = '99.0' WHERE key = 'version'", "catalog version is 99.0"),
+    ):
+        with sqlite3.connect(catalog) as connection:
+            connection.execute(change)
+        for attempt in (asyncio.to_thread(query_lake, lake, "SELECT 1"), archived(url, lake)):
+            with pytest.raises((DatabaseForeign, DatabaseUnavailable), match=re.escape(fault)) as refused:
+                await attempt
+            assert "\n" not in str(refused.value)
+
+
+async def test_a_file_of_another_program_is_no_catalog_and_stays_as_it_is(tmp_path: Path, lake: str) -> None:
+    url, catalog = put_memory(tmp_path / "memory.db"), tmp_path / "lake/catalog.sqlite"
+    await notes(url, "a")
+    catalog.parent.mkdir()
+    with sqlite3.connect(tmp_path / "other.db") as connection:
+        connection.execute("CREATE TABLE recipe (name TEXT)")
+    for content, fault in (
+        ((tmp_path / "other.db").read_bytes(), "is a database of another program"),
+        (b"a note " * 100, "is no catalog of a lake: file is not a database"),
+    ):
+        catalog.write_bytes(content)
+        for attempt in (archived(url, lake), asyncio.to_thread(query_lake, lake, "SELECT 1")):
+            with pytest.raises(DatabaseForeign, match=fault):
+                await attempt
+        assert catalog.read_bytes() == content
+        assert [*catalog.parent.iterdir()] == [catalog]
 
 
 def test_the_commands_archive_query_and_restore(tmp_path: Path) -> None:

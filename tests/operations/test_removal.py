@@ -47,11 +47,14 @@ async def recorded(url: str, *texts: str) -> list[str]:
     return ids
 
 
-async def erased(url: str, *names: str, spool: Path | None = None, reason: str = "asked to") -> list[ErasedEpisode]:
+async def erased(
+    url: str, *names: str, spool: Path | None = None, reason: str = "asked to", lake: str | None = None
+) -> list[ErasedEpisode]:
     address = DatabaseAddress.parse(url)
     log = await EventLog.open(address, create=True)
     try:
-        return await erase(log, await erasable(log, names), reason=reason, spool=spool or address.default_spool)
+        rows = await erasable(log, names)
+        return await erase(log, rows, reason=reason, spool=spool or address.default_spool, lake=lake)
     finally:
         await log.close()
 
