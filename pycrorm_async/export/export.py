@@ -18,6 +18,7 @@ import inspect
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from importlib.metadata import entry_points
 from os import PathLike
 from pathlib import Path
@@ -33,7 +34,8 @@ from pycrorm_async.export import selection as selections
 from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written
 from pycrorm_async.export.lerobot import LEROBOT, ImageSize, check_size
 from pycrorm_async.export.neem import NEEM
-from pycrorm_async.export.scenes import MCAP, RERUN, Clock
+from pycrorm_async.export.rerun_recording import RERUN
+from pycrorm_async.export.scenes import MCAP, Clock
 from pycrorm_async.export.traces import OTLP, TRACE
 from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
@@ -183,11 +185,15 @@ async def export(
     refuse_existing(selections.manifest_path(target), force=force)
     name = file_format or format_of(target)
     chosen = format_named(name)
+    beside = target.with_name(f"{target.name}.{chosen.beside}") if chosen.beside else None
+    if beside is not None:
+        refuse_existing(beside, force=force)
     options = _options(name, chosen, {"clock": clock, "fps": fps, "images": images, "no_formulas": no_formulas})
     is_of_rows, whole = chosen.holds == "rows", f"the format {name} holds whole episodes"
     if not is_of_rows and (episodes or isinstance(what, type | Select | Question)):
         raise CallerError(f"{whole}: name them by number, id or `last`")
-    with new_file(selections.manifest_path(target), force=force) as description:
+    further = new_file(beside, force=force) if beside is not None else nullcontext()
+    with new_file(selections.manifest_path(target), force=force) as description, further as unnamed_beside:
         selection = await selections.select_rows(
             reading, what, episodes, arguments=arguments, running=chosen.holds == "episode"
         )
@@ -197,6 +203,8 @@ async def export(
         folder = new_folder(target, force=force, marker=chosen.marker) if chosen.marker else None
         with folder or new_file(target, force=force) as unnamed:
             written = await chosen.write(job, unnamed)
+            if unnamed_beside is not None:
+                unnamed_beside.write_text(written.beside)
             log = await reading.log()
             manifest = _manifest(job, chosen, written, log.log_id, selections.checksums(unnamed, target.name))
             # Before the files get their names, so that a full disk leaves neither.

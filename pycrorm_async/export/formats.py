@@ -74,12 +74,14 @@ class Written(NamedTuple):
         query: the SQL of the rows; empty for a format that is made from events.
         columns: the Arrow type of each column, by name.
         unreadable: by number, the reasons why episodes are left out.
+        beside: the content of the file beside the export, for a format that has one.
     """
 
     rows: int
     query: str = ""
     columns: Mapping[str, str] = MappingProxyType({})
     unreadable: Mapping[int, str] = MappingProxyType({})
+    beside: str = ""
 
 
 class Format(NamedTuple):
@@ -93,6 +95,7 @@ class Format(NamedTuple):
         packages: those whose versions the manifest names.
         marker: of a data set in a folder, the file that each has; empty for a file.
         same_bytes: whether the same events give the same bytes.
+        beside: the suffix that a further file adds to the name of the export; empty without one.
     """
 
     write: Callable[[Job, Path], Awaitable[Written]]
@@ -102,6 +105,7 @@ class Format(NamedTuple):
     packages: tuple[str, ...] = ("pyarrow",)
     marker: str = ""
     same_bytes: bool = True
+    beside: str = ""
 
 
 # === row files ================================================================================================

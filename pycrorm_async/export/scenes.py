@@ -1,12 +1,12 @@
-"""Write episodes as motion over time: states and scene frames of robots, MCAP and rerun."""
+"""Read episodes as motion over time: states and scene frames of robots; write them as MCAP."""
 
 from __future__ import annotations
 
 import asyncio
 import heapq
+import json
 import logging
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -91,12 +91,15 @@ class ExportedEpisode(EpisodeReplay):
         self.numbers: dict[str, list[tuple[ReplayTime, float]]] = {}
         self.pictures: list[Picture] = []
         self._poses: dict[int, tuple[float, ...]] = {}
+        self._robots: dict[int, str] = {}
 
     def read(self, event: StoredEvent) -> event_types.Happening | None:
         """Apply the next event, as `EpisodeReplay.read`, and keep its change of the world."""
         happening = super().read(event)
         self.events.append(self.at)
         match happening:
+            case event_types.NodeStarted():
+                self._robots[event.sequence] = self.world.robot_name(happening.robot)
             case event_types.ObjectAdded():
                 self._change(event.sequence, _numbers(happening.pose), happening.joints)
             case event_types.ObjectMoved():
@@ -159,6 +162,22 @@ class ExportedEpisode(EpisodeReplay):
                 text = f"{dtype} {node.status}" + (f" {node.reason}: {node.message}" if node.reason else "")
                 lines.append(PlanLine(node.end, label, text, node.status in ("FAILED", "ERROR")))
         return sorted(lines, key=lambda each: each.when.sequence)
+
+    def action_lanes(self) -> dict[str, list[tuple[ReplayTime, str]]]:
+        """Return, by robot, its innermost running action whenever it changes; empty while none runs."""
+        actions = {start: each for start, each in self.nodes.items() if each.kind == "action"}
+        turns = [(each.start, start, True) for start, each in actions.items()]
+        turns += [(each.end, start, False) for start, each in actions.items() if each.end is not None]
+        lanes: dict[str, list[tuple[ReplayTime, str]]] = {}
+        running: dict[str, set[int]] = {}
+        for when, start, begins in sorted(turns):
+            robot = self._robots[start]
+            now = running.setdefault(robot, set())
+            (now.add if begins else now.discard)(start)
+            label, lane = self.label(actions[max(now)]) if now else "", lanes.setdefault(robot, [])
+            if not lane or lane[-1][1] != label:
+                lane.append((when, label))
+        return lanes
 
 
 def _numbers(pose: event_types.PoseValue) -> tuple[float, ...]:
@@ -312,6 +331,8 @@ def _subtasks(episode: ExportedEpisode, at: Sequence[ReplayTime]) -> Iterator[st
 
 # === pictures =================================================================================================
 
+VIEWS_MAX = 4
+"""Bounds the cameras that have a view when a file is opened."""
 _PICTURES_BYTES_MAX = 512_000_000
 """Bounds the bytes of the pictures of a file, which are in memory while it is written."""
 _log = logging.getLogger(__name__)
@@ -374,8 +395,8 @@ def write_mcap(
     path: Path,
     report_events: Callable[[int], object],
     options: Mapping[str, Any],
-) -> int:
-    """Write the file and return the number of messages. `report_events` gets the event of the latest one.
+) -> Written:
+    """Write the file and return the number of messages, and a layout. `report_events` gets the event of the latest one.
 
     Raises `MissingExtra`.
     """
@@ -414,7 +435,28 @@ def write_mcap(
             if count % REPORTED_CHANGES == 0:
                 report_events(when.sequence)
         writer.finish()
-    return count
+    return Written(count, beside=_layout(episode, channels))
+
+
+def _layout(episode: ExportedEpisode, topics: Iterable[str]) -> str:
+    """Return a layout as Foxglove exports one: the scene, and the first cameras, the joints that move and the plan."""
+    shown = {each: {"visible": True} for each in topics if each.startswith(("/scene", "/cloud/"))}
+    cameras = [each for each in topics if each.startswith("/camera/")][:VIEWS_MAX]
+    moved = dict.fromkeys(name for each in episode.changes if not each.adds for name in each.joints)
+    robots = [each for each in topics if each.startswith("/joint_states/")]
+    values = [f"{each}.joints[:]{{name=={json.dumps(name)}}}.position" for each in robots for name in moved]
+    curves = [{"value": each, "enabled": True, "timestampMethod": "receiveTime"} for each in values]
+    modes = [{"imageMode": {"imageTopic": each}} for each in cameras]
+    panels: dict[str, Any] = {f"Image!{index}": each for index, each in enumerate(modes)}
+    panels |= {"Plot!joints": {"paths": curves}} if curves else {}
+    panels["RosOut!plan"] = {"topicToRender": "/plan", "minLogLevel": 1}
+    *others, last = panels
+    beside: Any = last
+    for count, each in enumerate(reversed(others), 2):
+        beside = {"direction": "column", "first": each, "second": beside, "splitPercentage": 100 / count}
+    scene = {"3D!scene": {"followTf": MAP, "fixedFrame": MAP, "topics": shown}}
+    arranged = {"direction": "row", "first": "3D!scene", "second": beside, "splitPercentage": 65}
+    return json.dumps({"configById": scene | panels, "globalVariables": {}, "userNodes": {}, "layout": arranged})
 
 
 def _metadata(episode: ExportedEpisode) -> dict[str, str]:
@@ -511,7 +553,7 @@ def _pictures(episode: ExportedEpisode, kinds: Any, stamp: _Stamp) -> Iterator[_
             fields = [kinds.PackedElementField(name=each, offset=4 * at, type=real) for at, each in enumerate("xyz")]
             points = np.asarray(data, "<f4").tobytes()
             described = {"frame_id": MAP, "point_stride": 12, "fields": fields, "data": points}
-            yield when, f"/cloud/{_named(name)}", kinds.PointCloud(timestamp=stamp(when), **described)
+            yield when, f"/cloud/{named(name)}", kinds.PointCloud(timestamp=stamp(when), **described)
             continue
         if isinstance(data, bytes):
             encoded, form = data, observed_images.image_type(data).removeprefix("image/")
@@ -519,7 +561,7 @@ def _pictures(episode: ExportedEpisode, kinds: Any, stamp: _Stamp) -> Iterator[_
             pixels = observed_images.colored(data) if kind == "depth" else data
             encoded, form = observed_images.png_of(pixels, 1), "png"
         image = kinds.CompressedImage(timestamp=stamp(when), frame_id=name, data=encoded, format=form)
-        yield when, f"/camera/{_named(name)}", image
+        yield when, f"/camera/{named(name)}", image
 
 
 def _vector(kinds: Any, values: Sequence[float]) -> Any:
@@ -528,171 +570,6 @@ def _vector(kinds: Any, values: Sequence[float]) -> Any:
 
 def _rotation(kinds: Any, values: Sequence[float]) -> Any:
     return kinds.Quaternion(**dict(zip("xyzw", values, strict=True)))
-
-
-# === rerun file ===============================================================================================
-#
-# Write an episode as a rerun recording: boxes, cylinders and spheres in a tree of frames, and the plan as a log.
-#
-# The timelines are `event`, the sequence of the event, and `time`, since the episode's start. All changes of one frame
-# are one column (`send_columns`), so that a recording is small and opens at once.
-
-_APPLICATION = "pycrorm"
-_VIEWS_MAX = 4
-"""Bounds the cameras that have a view when a recording is opened."""
-
-
-def write_rerun(
-    episode: ExportedEpisode,
-    objects: dict[int, SceneObject],
-    path: Path,
-    report_events: Callable[[int], object],
-    _options: Mapping[str, Any],
-) -> int:
-    """Write the file and return the number of changes in it. `report_events` gets the event of the latest change.
-
-    Raises `MissingExtra`; `OSError` if the disk is full.
-    """
-    os.environ.setdefault("RERUN_ANALYTICS", "0")  # its first start would print a notice and ask a server
-    try:
-        import rerun as rr
-    except ImportError:
-        raise MissingExtra("rerun recordings need rerun-sdk: pip install 'pycrorm-async[rerun]'") from None
-
-    recording = rr.RecordingStream(_APPLICATION, recording_id=episode.id)
-    # Not `save`, whose thread only logs that the disk is full. The changes below take more memory than the file.
-    encoded = recording.memory_recording()
-    recording.send_recording_name(f"episode {episode.number}: {episode.started.description}")
-    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    entities: dict[str, str] = {MAP: "world"}
-    changes: dict[str, list[FrameChange]] = {}
-    count = 0
-    for each in frame_changes(episode, objects):
-        entities.setdefault(each.child, f"{entities[each.parent]}/{_part(each.child)}")
-        changes.setdefault(each.child, []).append(each)
-        count += 1
-        if count % REPORTED_CHANGES == 0:
-            report_events(each.when.sequence)
-    for frame, moved in changes.items():
-        recording.send_columns(
-            entities[frame],
-            indexes=_indexes(rr, [each.when for each in moved]),
-            columns=rr.Transform3D.columns(
-                translation=[each.translation for each in moved], quaternion=[each.rotation for each in moved]
-            ),
-        )
-    for change in (each for each in episode.changes if each.adds):
-        recording.set_time("event", sequence=change.when.sequence)
-        recording.set_time("time", duration=change.when.since_ns / 1e9)
-        for frame, shapes in objects[change.object].shapes.items():
-            _log_shapes(rr, recording, entities[frame], shapes)
-    recording.reset_time()
-    count += _send_removals(rr, recording, episode, objects, entities)
-    count += _send_plan(rr, recording, episode)
-    count += _send_observed(rr, recording, episode)
-    recording.flush()
-    path.write_bytes(encoded.drain_as_bytes())
-    recording.disconnect()
-    return count
-
-
-def _part(frame: str) -> str:
-    """Return the last part of an entity path, without the characters that have a meaning in rerun."""
-    return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
-
-
-def _named(observation: str) -> str:
-    """Return the name of an observation as one part of a topic or an entity path."""
-    return _part(observation.replace("/", "_"))
-
-
-def _indexes(rr: Any, whens: Sequence[ReplayTime]) -> list[Any]:
-    return [
-        rr.TimeColumn("event", sequence=[each.sequence for each in whens]),
-        rr.TimeColumn("time", duration=[each.since_ns / 1e9 for each in whens]),
-    ]
-
-
-def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[SceneShape]) -> None:
-    """Log the shapes of a frame at the set time, and not as static, because static ones cannot be cleared."""
-    by_kind: dict[str, list[SceneShape]] = {}
-    for each in shapes:
-        by_kind.setdefault(each.kind, []).append(each)
-    for kind, members in by_kind.items():
-        placed: Mapping[str, Any] = {
-            "centers": [each.translation for each in members],
-            "quaternions": [each.rotation for each in members],
-            "colors": [each.color for each in members],
-            "fill_mode": "solid",
-        }
-        sizes = [each.sizes for each in members]
-        match kind:
-            case "box":
-                shown = rr.Boxes3D(half_sizes=[[edge / 2 for edge in each] for each in sizes], **placed)
-            case "sphere":
-                shown = rr.Ellipsoids3D(half_sizes=[[each[0]] * 3 for each in sizes], **placed)
-            case _:  # a capsule is shown as the cylinder between its ends
-                shown = rr.Cylinders3D(radii=[each[0] for each in sizes], lengths=[each[1] for each in sizes], **placed)
-        recording.log(f"{entity}/shape_{kind}", shown)
-
-
-def _send_removals(
-    rr: Any, recording: Any, episode: ExportedEpisode, objects: Mapping[int, SceneObject], entities: Mapping[str, str]
-) -> int:
-    """Make an object vanish at the event that removed it, and count the removals; not at the end of the episode.
-
-    Leaving a world removes all its objects, and a recording that ends with an empty scene shows nothing when opened.
-    """
-    last = max((each.when.sequence for each in episode.changes if not each.removed), default=0)
-    removals = [each for each in episode.changes if each.removed and each.when.sequence < last]
-    for each in removals:
-        entity = entities[objects[each.object].name]
-        recording.send_columns(entity, indexes=_indexes(rr, [each.when]), columns=rr.Clear.columns(is_recursive=[True]))
-    return len(removals)
-
-
-def _send_plan(rr: Any, recording: Any, episode: ExportedEpisode) -> int:
-    """Send a line for each start and end of a node; return their number."""
-    lines = episode.plan_lines()
-    if lines:
-        recording.send_columns(
-            "plan",
-            indexes=_indexes(rr, [each.when for each in lines]),
-            columns=rr.TextLog.columns(
-                text=[each.text for each in lines], level=["ERROR" if each.is_failure else "INFO" for each in lines]
-            ),
-        )
-    return len(lines)
-
-
-def _send_observed(rr: Any, recording: Any, episode: ExportedEpisode) -> int:
-    """Send the observed pictures and numbers, and how the viewer lays them out beside the scene; return their count."""
-    cameras: dict[str, str] = {}
-    for when, name, kind, data in episode.pictures:
-        recording.set_time("event", sequence=when.sequence)
-        recording.set_time("time", duration=when.since_ns / 1e9)
-        if kind == "points":
-            recording.log(f"world/clouds/{_named(name)}", rr.Points3D(data, radii=rr.Radius.ui_points(1.5)))
-            continue
-        entity = cameras.setdefault(name, f"cameras/{_named(name)}")
-        if isinstance(data, bytes):
-            recording.log(entity, rr.EncodedImage(contents=data, media_type=observed_images.image_type(data)))
-        else:
-            recording.log(entity, rr.DepthImage(data) if kind == "depth" else rr.Image(data.squeeze()))
-    recording.reset_time()
-    for name, numbers in episode.numbers.items():
-        recording.send_columns(
-            f"numbers/{_named(name)}",
-            indexes=_indexes(rr, [when for when, _ in numbers]),
-            columns=rr.Scalars.columns(scalars=[number for _, number in numbers]),
-        )
-    views = rr.blueprint
-    seen = [views.Spatial2DView(origin=entity, name=name) for name, entity in list(cameras.items())[:_VIEWS_MAX]]
-    curves = [views.TimeSeriesView(origin="numbers", name="numbers")] if episode.numbers else []
-    beside = views.Vertical(*seen, *curves, views.TextLogView(origin="plan", name="plan"))
-    scene = views.Spatial3DView(origin="world", name="scene")
-    recording.send_blueprint(views.Blueprint(views.Horizontal(scene, beside, column_shares=[2, 1])))
-    return len(episode.pictures) + sum(map(len, episode.numbers.values()))
 
 
 # === scene frames =============================================================================================
@@ -824,10 +701,20 @@ def _parts(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, 
     return pose.position, (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)
 
 
+def part(frame: str) -> str:
+    """Return the last part of an entity path, without the characters that have a meaning in rerun."""
+    return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
+
+
+def named(observation: str) -> str:
+    """Return the name of an observation as one part of a topic or an entity path."""
+    return part(observation.replace("/", "_"))
+
+
 # === formats ==================================================================================================
 
 _WriteScene: TypeAlias = Callable[
-    [ExportedEpisode, dict[int, SceneObject], Path, Callable[[int], object], Mapping[str, Any]], int
+    [ExportedEpisode, dict[int, SceneObject], Path, Callable[[int], object], Mapping[str, Any]], Written
 ]
 
 
@@ -842,9 +729,9 @@ async def write_scene(write: _WriteScene, job: Job, path: Path) -> Written:
     await read_pictures(job.reading, episode)
     report = job.reporter("writing")
     # A cancelled task waits for the end of the thread: a file that is deleted while it writes would crash the process.
-    count = await run_to_completion(asyncio.to_thread(write, episode, objects, path, report, job.options))
+    written = await run_to_completion(asyncio.to_thread(write, episode, objects, path, report, job.options))
     report(covered.events)
-    return Written(count)
+    return written
 
 
 MCAP = Format(
@@ -853,7 +740,5 @@ MCAP = Format(
     holds="episode",
     options={"clock": "time", "fps": 10},
     packages=("mcap", "foxglove-sdk"),
-)
-RERUN = Format(
-    partial(write_scene, write_rerun), noun="change", holds="episode", packages=("rerun-sdk",), same_bytes=False
+    beside="layout.json",
 )

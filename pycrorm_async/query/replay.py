@@ -126,6 +126,13 @@ class ReplayedWorld:
         present = self.objects.get(robot.object.object)
         return present.pose if present is not None else None
 
+    def robot_name(self, robot: event_types.RobotValue | None) -> str:
+        """Return the name of a robot that acts; that of its object in events of older versions, else its type."""
+        if robot is None:
+            return ""
+        name = robot.name or (self.name_of(robot.object.object) if robot.object is not None else None)
+        return name or robot.object_type
+
     def name_of(self, identity: int) -> str | None:
         """Return the name of an object, also of a removed one; None if it was never added."""
         added = self.added.get(identity)

@@ -116,15 +116,8 @@ class EpisodePage(EpisodeReplay):
         parameters = self.parameters(node)
         short = parameters_text(parameters)
         texts = [number(each) for each in (node.kind, self.dtype(node), short, node.status)]
-        acted = [number(self._robot_name(robot)), number(self._whole(parameters, short))]
+        acted = [number(self.world.robot_name(robot)), number(self._whole(parameters, short))]
         self._rows[start] = [start, 0, node.parent or 0, *texts, 0, 0, *acted, 0]
-
-    def _robot_name(self, robot: event_types.RobotValue | None) -> str:
-        """Return the name of the robot that acts; that of its object in events of older versions, else its type."""
-        if robot is None:
-            return ""
-        name = robot.name or (self.world.name_of(robot.object.object) if robot.object is not None else None)
-        return name or robot.object_type
 
     def _whole(self, parameters: Mapping[str, Any], short: str) -> str:
         """Return a line for each parameter, with its whole value; empty if `short` has it or they are too many."""

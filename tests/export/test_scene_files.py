@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
+import json
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -18,7 +20,8 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.events.types import Blob
 from pycrorm_async.export.export import FORMATS, export, export_again
-from pycrorm_async.export.scenes import write_mcap, write_rerun, write_scene
+from pycrorm_async.export.rerun_recording import write_rerun
+from pycrorm_async.export.scenes import write_mcap, write_scene
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.scene import link_poses, object_model
@@ -232,7 +235,10 @@ async def seen(tmp_path: Path) -> AsyncIterator[Reading]:
     url = f"sqlite:///{tmp_path / 'seen.db'}"
     with Memory.sync(url) as memory:
         with memory.recording.episode(description="what it saw") as episode:
-            episode.object_added("robot", "agv", "ROBOT", Pose([0, 0, 0]), joints={"lift": 0.0})
+            episode.object_added("robot", "agv", "ROBOT", Pose([0, 0, 0]), joints={"lift": 0.0, "still": 0.0})
+            for name in ("Look", "Turn"):
+                action = memory.recording.type("action", name)
+                episode.start(name, action, parent="Look" if name == "Turn" else None, robot="robot")
             episode.observe("head/camera", {"rgb": Blob(png_of(PIXELS), "image/png"), "exposure": 0.25})
             episode.joints_moved("robot", {"lift": 0.5})
             episode.observe("depth", np.linspace(0.5, 2, 400, dtype=np.float32).reshape(20, 20))
@@ -241,6 +247,8 @@ async def seen(tmp_path: Path) -> AsyncIterator[Reading]:
             episode.observe("fake", Blob(b"no image", "image/png"))
             episode.observe("nothing", np.full((20, 20), np.nan))
             episode.observe("mask", np.eye(20, dtype=bool))
+            episode.end("Turn")
+            episode.end("Look")
         memory.flush()
     async with Reading.open(url) as reading:
         yield reading
@@ -268,7 +276,26 @@ async def test_an_mcap_file_has_what_was_observed_and_the_joints(
     assert (image.format, image.data) == ("png", png_of(PIXELS))
     points = by_topic["/cloud/lidar"]
     assert np.frombuffer(points.data, "<f4").reshape(-1, 3).tolist() == np.arange(300).reshape(100, 3).tolist()
-    assert [(each.name, each.position) for each in by_topic["/joint_states/agv"].joints] == [("lift", 0.5)]
+    assert [(each.name, each.position) for each in by_topic["/joint_states/agv"].joints] == [
+        ("lift", 0.5),
+        ("still", 0.0),
+    ]
+    layout = json.loads((tmp_path / "seen.mcap.layout.json").read_text())
+    panels = layout["configById"]
+    assert [*panels] == ["3D!scene", "Image!0", "Image!1", "Image!2", "Image!3", "Plot!joints", "RosOut!plan"]
+    assert panels["3D!scene"]["topics"].keys() == {"/scene", "/cloud/lidar"}
+    cameras = {each["imageMode"]["imageTopic"] for name, each in panels.items() if name.startswith("Image")}
+    assert cameras == {each for each in by_topic if each.startswith("/camera/")}
+    [curve] = panels["Plot!joints"]["paths"]
+    assert curve["value"] == '/joint_states/agv.joints[:]{name=="lift"}.position'
+    arranged = [layout["layout"]]
+    while isinstance(arranged[-1], dict):
+        arranged[-1:] = arranged[-1]["first"], arranged[-1]["second"]
+    assert arranged == [*panels]
+    (tmp_path / "seen.mcap").unlink()
+    (tmp_path / "seen.mcap.manifest.json").unlink()
+    with pytest.raises(CallerError, match=r"layout\.json exists"):
+        await export(seen, 1, tmp_path / "seen.mcap")
 
 
 async def test_a_rerun_recording_has_what_was_observed_and_a_layout(seen: Reading, tmp_path: Path) -> None:
@@ -282,4 +309,10 @@ async def test_a_rerun_recording_has_what_was_observed_and_a_layout(seen: Readin
     assert bytes(encoded["EncodedImage:blob"][0]) == png_of(PIXELS)
     numbers = [each for each in chunks if each.startswith("/numbers/")]
     assert numbers == ["/numbers/head_camera.exposure"]  # and not the size of a blob
+    lift = chunks["/joints/agv/lift"].to_record_batch().to_pylist()
+    assert [each["Scalars:scalars"] for each in lift] == [[0.0], [0.5]]
+    states = chunks["/actions/agv"].to_record_batch().to_pylist()
+    assert [each["StateChange:state"] for each in states] == [["Look"], ["Turn"], ["Look"], [""]]
     assert len(reader.blueprints()) == 1
+    verify = sys.executable, "-m", "rerun", "rrd", "verify", tmp_path / "seen.rrd"
+    assert await (await asyncio.create_subprocess_exec(*verify)).wait() == 0
