@@ -1,6 +1,6 @@
 """Measure what advice is worth in a kitchen: failed attempts and objects placed, with `memory.advising` and without.
 
-    python -m bench.advised                60 tasks for each of three seeds, 20 minutes
+    python -m bench.advised                40 tasks for each of three seeds, some minutes
     python -m bench.advised --quick        one seed, a few tasks
 
 A memory remembers 300 tries of the default policy: milk at a random place on one of the three worktops, turned at
@@ -46,7 +46,7 @@ from pycrorm_async.query.frames import NORMAL_95
 from pycrorm_async.query.success import interval_95
 from pycrorm_async.world import Pose
 
-REMEMBERED, TASKS, SEEDS, TRIES_MAX, SAMPLES, MINIMUM = 300, 60, 3, 5, 100, 0.3
+REMEMBERED, TASKS, SEEDS, TRIES_MAX, SAMPLES, MINIMUM = 300, 40, 3, 5, 100, 0.3
 
 WAYS: dict[str, Callable[[Memory], AbstractContextManager[None]]] = {
     "on its own": lambda _: nullcontext(),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy
 from pycrorm_async.learning.policy_file import name_of
 from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask
-from pycrorm_async.learning.recorded_policy import record_policy
+from pycrorm_async.learning.recorded_policy import Evaluation, read_evaluation, record_evaluation, record_policy
 from pycrorm_async.learning.rollouts import Tally, tally_of
 from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.learning.tree import check_leaf, learn
@@ -221,19 +222,32 @@ class _PhaseRunner:
                 return
             training = recorded_rollouts.episodes_question(scene=scene, seeds=seeds, policies=policies)
             episodes = list(await session.scalars(training))
+        async with self._recording(f"learned policy {name}") as memory:
+            await record_policy(
+                memory,
+                policy,
+                episodes=episodes,
+                successes=successes,
+                min_samples_leaf=experiment.min_samples_leaf,
+                rollouts=rounds * experiment.rollouts,
+                scene=scene,
+                seeds=seeds,
+            )
+
+    async def record_evaluation(self, policy: Policy, evaluation: Evaluation) -> None:
+        """Record the evaluation of a policy, unless one is recorded."""
+        name = name_of(policy)
+        if await read_evaluation(self._reading, name) is None:
+            async with self._recording(f"evaluation of policy {name}") as memory:
+                record_evaluation(memory, name, evaluation)
+
+    @asynccontextmanager
+    async def _recording(self, description: str) -> AsyncIterator[Memory]:
+        """Record an episode; it is visible afterwards."""
         # The daemon that drains the workers' recorders drains this one too.
         async with Memory.open(self._place.url, spool=self._place.spool, writer="daemon", settings=SETTINGS) as memory:
-            async with memory.episode(description=f"learned policy {name}", plan="learn", seed=experiment.seed):
-                await record_policy(
-                    memory,
-                    policy,
-                    episodes=episodes,
-                    successes=successes,
-                    min_samples_leaf=experiment.min_samples_leaf,
-                    rollouts=rounds * experiment.rollouts,
-                    scene=scene,
-                    seeds=seeds,
-                )
+            async with memory.episode(description=description, plan="learn", seed=self._experiment.seed):
+                yield memory
             await memory.flush()
 
 
@@ -267,12 +281,10 @@ async def run(
         await runner.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
         held_out = await runner.phase("default policy, held out", default_policy(), held_out_seed, experiment.held_out)
-        return ExperimentResult(
-            tuple(runner.phases),
-            policy,
-            tuple(choice for frame in frames for choice in choices_of(frame)),
-            coverage_of(held_out, policy),
-        )
+        coverage = coverage_of(held_out, policy)
+        await runner.record_evaluation(policy, Evaluation(coverage=coverage))
+        choices = tuple(choice for frame in frames for choice in choices_of(frame))
+        return ExperimentResult(tuple(runner.phases), policy, choices, coverage)
 
 
 async def read_rollouts(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:

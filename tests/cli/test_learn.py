@@ -61,6 +61,24 @@ def test_recorded_rollouts_are_not_repeated(document: Any, folder: Path) -> None
     assert (folder / "two.svg").read_text().startswith("<?xml")
 
 
+def test_the_memory_lists_its_policies_and_writes_their_files(document: Any, folder: Path, tmp_path: Path) -> None:
+    name, phases = document["policy"]["name"], document["phases"]
+    listed = {each["name"]: each for each in answer("policies", cwd=folder)}
+    assert listed[name]["learned_from"] == 400
+    assert listed[name]["kind"] == "tree"
+    assert listed[name_of(default_policy())]["kind"] == "default policy"
+    card = answer("policy", name[:5], "--out", str(tmp_path / "copy.json"), cwd=folder)
+    assert (tmp_path / "copy.json").read_bytes() == (folder / "policy.json").read_bytes()
+    assert card["evaluation"]["coverage"] == document["coverage"]
+    assert card["scenes"][document["scene"]]["successes"] == phases[1]["successes"]
+    shown = pycrorm("policy", name[:5], cwd=folder)
+    assert f"Policy {name}" in shown.stdout
+    assert f"{document['coverage']:.1%}" in shown.stdout
+    refused = pycrorm("policy", "nothing", cwd=folder)
+    assert "the memory names no policy 'nothing'" in one_line_of(refused)
+    assert refused.returncode == 2
+
+
 @pytest.mark.soak
 def test_a_study_is_printed_as_a_table(folder: Path) -> None:
     done = pycrorm(*BY_ONE, "--resume", "--study", "2", cwd=folder)

@@ -32,6 +32,7 @@ FORMS = [
     "export 1 --out {OUT}.jsonl", "export 1 3 --format lerobot --out {OUT}", "export 1 --out {OUT}.rrd",
     "export 1 2 3 --out {OUT}.parquet", "export 1 --out {OUT}.mcap",
     "copy --to sqlite:///{OUT}.db", "copy --to sqlite:///{OUT}2.db --json", "rebuild",
+    "policies", "policies --json", "policy {BAD}",
     "datasette-metadata", "erase 1 --reason {BAD} --dry-run", "erase", "spool inspect --json", "watch 1 --terminal",
     *(f"ask {each}" for each in ("root_failures", "failures_by_cause", "steps_before_failures", "longest_actions")),
     *(f"ask {each}" for each in ("durations", "arms_used", "successful_pick_ups", "episodes")),

@@ -1,0 +1,40 @@
+"""List the policies that pick-ups were chosen by, the latest learned first.
+
+Panel: Ask, 4.
+"""
+
+from __future__ import annotations
+
+from pycrorm_async.cli.output import Form, moment, note, print_rows, print_table
+from pycrorm_async.cli.reading import Place
+
+
+def policies(*, place: Place, form: Form) -> None:
+    """List the policies that pick-ups were chosen by, the latest learned first: their origin, their use, their success.
+
+    `succeeded` is the share of the pick-ups that a policy chose, with the interval of 95 %.
+    """
+    from pycrorm_async.learning.policy_cards import read_policies  # loads numpy and the mapped classes
+
+    summaries = place.read(read_policies)
+    if not summaries and form.is_table:
+        note("no policy is recorded: `pycrorm learn` learns one")
+        return
+    columns = ("policy", "kind", "robots", "objects", "learned from", "learned", "used", "succeeded")
+    rows = [
+        (
+            each.name,
+            each.kind,
+            ", ".join(each.robots),
+            ", ".join(each.objects),
+            each.learned_from,
+            each.learned_at and moment(each.learned_at),
+            each.used,
+            str(each.succeeded),
+        )
+        for each in summaries
+    ]
+    if form.is_table:
+        print_table(f"Policies of {place.address}", columns, rows)
+    else:
+        print_rows(form, summaries, "", columns, rows)
