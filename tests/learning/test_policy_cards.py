@@ -43,8 +43,10 @@ async def test_a_card_has_the_origin_of_a_policy_and_the_success_of_what_it_chos
             lower = await batch_rollout(
                 MoveAndPickUp(stage.target, policy=LEARNED), 5, seed=1, scene=str(low), reset=stage.reset
             )
-        origin = {"episodes": ["a", "b"], "successes": 30, "min_samples_leaf": 25}
-        await record_policy(memory, LEARNED, **origin, rollouts=42, scene="here", seeds=[1, 2], evaluation=EVALUATION)
+        await record_policy(
+            memory, LEARNED, episodes=["a", "b"], successes=30, min_samples_leaf=25, rollouts=42, scene="here",
+            seeds=[1, 2], evaluation=EVALUATION,
+        )  # fmt: skip
         await memory.flush()
 
         [summary] = await read_policies(memory.reading)
