@@ -92,7 +92,7 @@ async def _erase(
             return 0
         if not yes:
             listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
-            _ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
+            ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
         await log.close()
         log = await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id)
         spool = place.spool or place.address.default_spool
@@ -100,13 +100,19 @@ async def _erase(
     finally:
         await log.close()
     _print(form, f"Erased from {place.address}", [each.removed for each in done])
+    return name_what_is_left(done)
+
+
+def name_what_is_left(done: Sequence[removal.ErasedEpisode]) -> int:
+    """Print a line for each part of an erased episode that is left; return the exit code."""
     for each in done:
         for what in each.left:
             problem(f"episode {each.removed.number} is erased from the log, and parts of it are left in {what}")
     return 1 if any(each.left for each in done) else 0
 
 
-def _ask(question: str) -> None:
+def ask(question: str) -> None:
+    """Ask before episodes are erased. Raises `CallerError` unless the answer is yes."""
     with suppress(typer.Abort):  # also where no terminal answers
         if typer.confirm(question, err=True):
             return
@@ -131,10 +137,11 @@ def _print(form: Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) 
     for each in rows:
         removal: tuple[str | None, ...] = ("", "", "")
         if isinstance(each, RemovedEpisode):
-            removal = _moment(each.removed_wall_ns), each.reason, each.archived_in
-        cells.append((each.number, each.id, each.head, _moment(each.ended_wall_ns), *removal))
+            removal = moment_of(each.removed_wall_ns), each.reason, each.archived_in
+        cells.append((each.number, each.id, each.head, moment_of(each.ended_wall_ns), *removal))
     print_rows(form, [each._asdict() for each in rows], title, columns, cells)
 
 
-def _moment(wall_ns: int | None) -> str:
+def moment_of(wall_ns: int | None) -> str:
+    """Return this time as a cell of a table."""
     return "" if wall_ns is None else moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))

@@ -283,6 +283,12 @@ _UNITS = {
 }
 
 
+def parse_age(text: str) -> timedelta | None:
+    """Return the age, such as 90d; None if the text is none. Raises `OverflowError` for one that is too great."""
+    age = _AGE.fullmatch(text.strip())
+    return int(age[1]) * _UNITS[age[2]] if age else None
+
+
 def parse_since(text: str, now: datetime | None = None) -> datetime:
     """Return the time.
 
@@ -294,8 +300,8 @@ def parse_since(text: str, now: datetime | None = None) -> datetime:
     Raises `CallerError` for another text.
     """
     try:
-        if age := _AGE.fullmatch(text.strip()):
-            return (now or datetime.now(UTC)) - int(age[1]) * _UNITS[age[2]]
+        if (age := parse_age(text)) is not None:
+            return (now or datetime.now(UTC)) - age
         moment = datetime.fromisoformat(text.strip())
     except (ValueError, OverflowError):
         raise CallerError(

@@ -9,7 +9,7 @@ the commit leaves files that the catalog does not know; an hour later the next a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
@@ -41,10 +41,13 @@ async def archive_episodes(
     address: str,
     *,
     before: datetime,
+    only: Collection[int] | None = None,
     reason: str,
     report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
 ) -> ArchiveSummary:
     """Move the episodes that ended before this time into the lake at this address, which is made if it is missing.
+
+    With `only`, those among them with one of these numbers.
 
     Leaves out episodes that are stopped or not visible yet. Raises `CallerError` while another archive or rebuild of
     the memory runs, `MissingExtra`, and errors of both databases; what was moved until then stays moved.
@@ -59,6 +62,7 @@ async def archive_episodes(
             try:
                 end_ns = before.timestamp() * 1e9
                 rows = [each for each in await log.episodes() if _may_go(each, end_ns)]
+                rows = rows if only is None else [each for each in rows if each.number in only]
                 total, done = sum(each.head for each in rows), 0
                 for some in _parts(rows):
                     await _archive(log, lake, some, reason, summary)

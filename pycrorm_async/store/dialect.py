@@ -197,14 +197,23 @@ class Dialect(ABC):
         named = [(each,) for each in fingerprints]
         return await self.payloads(connection, schema.SELECT_DESCRIPTIONS, fingerprints=named)
 
-    async def removed(self, connection: AsyncConnection, statement: Executable, **values: Any) -> list[RemovedEpisode]:
-        """Execute a query of removed episodes; empty before the first removal. Raises `DatabaseUnavailable`."""
-        state = await self.table_state(connection, schema.REMOVED)
+    async def rows_if_created(
+        self, connection: AsyncConnection, table: Table, kind: Any, statement: Executable, **values: Any
+    ) -> list[Any]:
+        """Execute a query of a table that is not part of the log's format; empty before it is created.
+
+        Raises `DatabaseUnavailable` for a login that may not read it.
+        """
+        state = await self.table_state(connection, table)
         if state.exists and not state.readable:
             raise DatabaseUnavailable(
-                f"this login may not read {schema.REMOVED.name}: the owner runs `pycrorm roles --create` again"
+                f"this login may not read {table.name}: the owner runs `pycrorm roles --create` again"
             )
-        return await self.rows(connection, RemovedEpisode, statement, **values) if state.exists else []
+        return await self.rows(connection, kind, statement, **values) if state.exists else []
+
+    async def removed(self, connection: AsyncConnection, statement: Executable, **values: Any) -> list[RemovedEpisode]:
+        """Execute a query of removed episodes; empty before the first removal. Raises `DatabaseUnavailable`."""
+        return await self.rows_if_created(connection, schema.REMOVED, RemovedEpisode, statement, **values)
 
     # --- the log --------------------------------------------------------------------------------------------------
 

@@ -140,6 +140,17 @@ REMOVED: Final = sql.Table(
 """The episodes whose events have left the log, erased or archived, and those that a lake still has. Created with the
 first removal."""
 
+RETENTION: Final = sql.Table(
+    "pycrorm_retention",
+    METADATA,
+    _key("number", _Long),
+    *_required(keep=sql.Text),
+    sql.Column("keep_s", _Long),
+    *_required(tags=sql.Text),
+    sql.Column("archive_to", sql.Text),
+)
+"""The rules of `operations.retention`; tags are a JSON array. Created with the first rule."""
+
 
 # === values ===================================================================================================
 
@@ -389,6 +400,13 @@ UPDATE_RESTORED: Final = (
     .where(REMOVED.c.id == bindparam("restored"))
     .values(restored_wall_ns=bindparam("now_ns", type_=_Long))
 )
+
+SELECT_RULES: Final = select(RETENTION).order_by(RETENTION.c.number)
+_rules = _batch("rules", **{each.name: each.type for each in RETENTION.c})
+UPSERT_RULES: Final = _insert_batch(RETENTION, _rules).ext(
+    _OnConflict("number", updated=("keep", "keep_s", "archive_to"))
+)
+DELETE_RULE: Final = sql.delete(RETENTION).where(RETENTION.c.number == bindparam("number"))
 
 INSERT_BLOB: Final = _insert_one(BLOB, list(BLOB.c)).ext(_OnConflict("hash", "part"))
 SELECT_COMPLETE_BLOBS: Final = select(BLOB.c.hash).where(

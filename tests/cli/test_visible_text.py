@@ -39,7 +39,7 @@ FORMS = [
     "ask root_failures --json", "ask object_history --name MILK", "ask moves_of --name MILK",
 ]  # fmt: skip
 NOT_TRIED = {"demo", "import", "run", "learn", "plot", "mcp", "roles", "writer", "init", "examples"}
-NOT_TRIED |= {"archive", "lake", "restore"}  # their lines are those of `copy`, `query` and `erase`
+NOT_TRIED |= {"archive", "lake", "restore", "retention"}  # their lines are those of `copy`, `query` and `erase`
 """Verbs that record, serve agents (`tests/integrations/mcp`), draw pictures only or print none of what is recorded."""
 
 

@@ -447,4 +447,5 @@ def test_the_page_of_the_command_names_every_verb_and_no_other(tmp_path: Path) -
         done = CliRunner().invoke(app(verb), [verb, "--help"])  # as the command does
         assert done.exit_code == 0
         expected = {"spool": "repair", "copy": "--from", "ask": "root_failures", "examples": "FOLDER", "lake": "query"}
+        expected |= {"retention": "apply"}
         assert expected.get(verb, "--url") in done.stdout

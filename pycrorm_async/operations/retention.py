@@ -1,0 +1,191 @@
+"""`pycrorm retention`: rules, stored in the memory, of how long its episodes stay, and what becomes of them then.
+
+A rule has an age and tags, and concerns the episodes with all of these tags. Of several, the one with most tags
+decides, and among these the one that keeps longer: so `--keep forever --tag demo` is stronger than `--keep 90d`, and so
+is `--keep 7d --tag tryout`. An episode that no rule concerns stays, and so does one that has not ended.
+
+What a rule removes, the journal (`pycrorm_removed_episode`) names with the rule: `operations.removal` erases it, or
+`operations.archive` moves it into a lake.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
+from pycrorm_async.operations.removal import ErasedEpisode, erase
+from pycrorm_async.progress_bar import ProgressCallback
+from pycrorm_async.store import schema
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog, tags_of
+from pycrorm_async.store.stored import EpisodeRow
+
+_VERB: Final = "retention"
+"""Begins the reason in the journal of what a rule removed."""
+
+
+class RetentionRule(NamedTuple):
+    """One rule.
+
+    Attributes:
+        number: names it; assigned by `add_rule`.
+        keep: the age as the user wrote it, such as 90d, or "forever".
+        keep_s: the age in s, counted from the end of an episode; None for ever.
+        tags: all of these; none concerns every episode.
+        archive_to: the address of the lake to which the episodes go; None erases them.
+    """
+
+    number: int
+    keep: str
+    keep_s: int | None
+    tags: tuple[str, ...]
+    archive_to: str | None
+
+    def __str__(self) -> str:
+        tags = "".join(f" --tag {each}" for each in self.tags)
+        return f"{_VERB} --keep {self.keep}{tags}" + (f" --archive-to {self.archive_to}" if self.archive_to else "")
+
+
+class DueEpisode(NamedTuple):
+    """An episode that is older than the rule that decides about it keeps it."""
+
+    row: EpisodeRow
+    tags: tuple[str, ...]
+    rule: RetentionRule
+
+
+class RetentionResult(NamedTuple):
+    """The episodes that were erased, and the summaries of the archives by lake."""
+
+    erased: list[ErasedEpisode]
+    archived: dict[str, ArchiveSummary]
+
+
+def deciding_rule(rules: Collection[RetentionRule], tags: Collection[str]) -> RetentionRule | None:
+    """Return the rule that decides about an episode with these tags; None if none concerns it."""
+    apt = [each for each in rules if {*each.tags} <= {*tags}]
+    return max(
+        apt,
+        key=lambda each: (len(each.tags), math.inf if each.keep_s is None else each.keep_s, -each.number),
+        default=None,
+    )
+
+
+# --- the rules ------------------------------------------------------------------------------------------------
+
+
+async def read_rules(log: EventLog) -> list[RetentionRule]:
+    """Read the rules of a memory, by number. Raises `DatabaseUnavailable` for a login that may not read them."""
+    async with log.reading() as connection:
+        return await _rules(connection)
+
+
+async def _rules(connection: AsyncConnection) -> list[RetentionRule]:
+    table, query = schema.RETENTION, schema.SELECT_RULES
+    rows = await dialect_of(connection).rows_if_created(connection, table, RetentionRule, query)
+    return [each._replace(tags=tuple(json.loads(each.tags))) for each in rows]
+
+
+async def add_rule(
+    log: EventLog, keep: str, age: timedelta | None, tags: Collection[str], archive_to: str | None
+) -> RetentionRule:
+    """Store a rule, which replaces that of the same tags; `age` None keeps for ever.
+
+    Raises `CallerError` for a rule that keeps for ever and archives.
+    """
+    if age is None and archive_to is not None:
+        raise CallerError("--keep forever leaves nothing to archive: leave out --archive-to")
+    keep_s = None if age is None else int(age.total_seconds())
+    with log.translated():
+        async with log.writing() as connection:
+            dialect = dialect_of(connection)
+            await dialect.lock_log_changes(connection)
+            await dialect.create_if_missing(connection, schema.RETENTION)
+            numbers = {each.tags: each.number for each in await _rules(connection)}
+            named = tuple(sorted({*tags}))
+            number = numbers.get(named, 1 + max(numbers.values(), default=0))
+            rule = RetentionRule(number, keep, keep_s, named, archive_to)
+            stored = (number, keep, keep_s, json.dumps(named), archive_to)
+            await dialect.execute(connection, schema.UPSERT_RULES, rules=[stored])
+    return rule
+
+
+async def remove_rule(log: EventLog, number: int) -> RetentionRule:
+    """Remove a rule. Raises `CallerError` if there is none of this number."""
+    with log.translated():
+        async with log.writing() as connection:
+            for rule in await _rules(connection):
+                if rule.number == number:
+                    await dialect_of(connection).execute(connection, schema.DELETE_RULE, number=number)
+                    return rule
+    raise CallerError(f"there is no rule {number}: `pycrorm retention list` shows the rules")
+
+
+# --- their application ----------------------------------------------------------------------------------------
+
+
+async def due_episodes(log: EventLog, rules: Sequence[RetentionRule], now_ns: int) -> list[DueEpisode]:
+    """Return the episodes that rules no longer keep at this time, by number."""
+    due: list[DueEpisode] = []
+    for row in await log.episodes():
+        if not any(_is_over(each, row, now_ns) for each in rules):
+            continue
+        tags = await tags_of(log, row) if any(each.tags for each in rules) else ()
+        rule = deciding_rule(rules, tags)
+        if rule is not None and _is_over(rule, row, now_ns):
+            due.append(DueEpisode(row, tags, rule))
+    return due
+
+
+def _is_over(rule: RetentionRule, row: EpisodeRow, now_ns: int) -> bool:
+    ended_ns, keep_s = row.ended_wall_ns, rule.keep_s
+    return ended_ns is not None and keep_s is not None and ended_ns < now_ns - keep_s * 10**9
+
+
+async def apply_rules(
+    url: str,
+    log: EventLog,
+    confirmed: Collection[int],
+    now_ns: int,
+    *,
+    spool: Path,
+    report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
+) -> RetentionResult:
+    """Erase or archive those of the confirmed episodes, by number, that are due still; finish earlier erasures.
+
+    Raises the errors of `erase` and `archive_episodes`; what was removed until then stays removed.
+    """
+    due = [each for each in await due_episodes(log, await read_rules(log), now_ns) if each.row.number in confirmed]
+    by_rule: dict[RetentionRule, list[EpisodeRow]] = {}
+    for each in due:
+        by_rule.setdefault(each.rule, []).append(each.row)
+    result = RetentionResult([], {})
+    parts = [
+        each for each in await log.all_removed() if each.finished_wall_ns is None and each.reason.startswith(_VERB)
+    ]
+    if parts:
+        result.erased.extend(await erase(log, parts, reason=_VERB, spool=spool))
+    for rule, rows in by_rule.items():
+        if rule.archive_to is None:
+            result.erased.extend(await erase(log, rows, reason=str(rule), spool=spool))
+            continue
+        moved = await archive_episodes(
+            url,
+            rule.archive_to,
+            before=datetime.fromtimestamp(now_ns / 1e9, UTC),
+            only={each.number for each in rows},
+            reason=str(rule),
+            report_progress=report_progress,
+        )
+        earlier = result.archived.setdefault(rule.archive_to, ArchiveSummary([], {}))
+        earlier.removed.extend(moved.removed)
+        earlier.stayed.update(moved.stayed)
+    return result
