@@ -27,6 +27,7 @@ from pycrorm_async.learning.recorded_policy import read_policy, record_policy
 from pycrorm_async.learning.rollouts import Tally, batch_rollout, rollouts_question
 from pycrorm_async.learning.scenes import Disturbance, Scene, Stage
 from pycrorm_async.learning.success_model import Draws, SuccessModel
+from pycrorm_async.learning.transport import TransportPolicy
 from pycrorm_async.learning.tree import learn
 
 __all__ = [
@@ -54,6 +55,7 @@ __all__ = [
     "name_of",
     "draw_policies",
     "Disturbance",
+    "TransportPolicy",
     "Scene",
     "Stage",
     "batch_rollout",

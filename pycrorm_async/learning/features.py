@@ -227,7 +227,8 @@ def _turned(angle: Floats) -> Floats:
 def _axes(grasps: Sequence[Grasp], axis: str) -> Floats:
     """Return an axis of the hand in the object's frame for each grasp, shape (grasps, 3)."""
     unit = {"fingers": (1.0, 0.0, 0.0), "closing": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}[axis]
-    return np.array([tuple(rotated(GRASP_ORIENTATIONS[grasp], unit)) for grasp in grasps])
+    of_grasp = {grasp: tuple(rotated(GRASP_ORIENTATIONS[grasp], unit)) for grasp in set(grasps)}
+    return np.array([of_grasp[grasp] for grasp in grasps])
 
 
 def _side(grasp: Grasp) -> float:

@@ -9,7 +9,7 @@ import math
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from itertools import compress
+from itertools import chain, compress, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from pycrorm_async.learning.policy import (
     ARMS,
     GRASPS,
     Evidence,
+    Floats,
     PickUpChoice,
     Policy,
     Rectangle,
@@ -127,14 +128,14 @@ _NEAR_SURFACE_M = 0.03
 """The greatest distance in m between the underside of an object and the surface that it stands on."""
 
 
-def context_of(target: Object) -> PickUpContext:
-    """Return the circumstances of picking this object up with the acting robot. Moves nothing.
+def context_of(target: Object, *, at: Pose | None = None) -> PickUpContext:
+    """Return the circumstances of picking this object up with the acting robot, here or `at` a pose. Moves nothing.
 
     The edges are those of the box around the link that the object stands on, as seen from above. Raises `NoRobotHere`.
     """
-    robot, pose = objects.require_robot(), target.pose
+    robot, pose = objects.require_robot(), target.pose if at is None else at
     joint = robot.description.torso_joint
-    frames = [(target.link_pose(link).relative_to(pose), target.body.solids[link]) for link in target.links]
+    frames = [(target.link_pose(link).relative_to(target.pose), target.body.solids[link]) for link in target.links]
     box = box_around([((frame.position, frame.orientation), solids) for frame, solids in frames])
     return PickUpContext(
         height=pose.position.z - robot.body.pose.position.z,
@@ -142,13 +143,13 @@ def context_of(target: Object) -> PickUpContext:
         torso_limits=None if joint is None else robot.body.joint_limits(joint),
         size=None if box is None else (box.size.x, box.size.y, box.size.z),
         origin_height=math.nan if box is None else -box.min.z,
-        edges=() if box is None else tuple(_edges_below(robot, target, -box.min.z)),
+        edges=() if box is None else tuple(_edges_below(robot, target, pose, -box.min.z)),
     )
 
 
-def _edges_below(robot: objects.CurrentRobot, target: Object, origin_height: float) -> Iterator[Edge]:
-    """Yield the edges of the surface that the object stands on, in its own frame; none for an object in the air."""
-    x, y, z = target.pose.position
+def _edges_below(robot: objects.CurrentRobot, target: Object, pose: Pose, origin_height: float) -> Iterator[Edge]:
+    """Yield the edges of the surface that the object stands on at this pose, in its frame; none in the air."""
+    x, y, z = pose.position
     below = (x, y, z - origin_height - _NEAR_SURFACE_M)
     [support] = target.world.ray_test([(x, y, z)], [below], ignore=[target, *robot.with_load()])
     if support is None:
@@ -166,7 +167,7 @@ def _edges_below(robot: objects.CurrentRobot, target: Object, origin_height: flo
                 tops.append((top, frame, at, box))
     if tops:
         _, frame, at, box = max(tops, key=lambda each: each[0])
-        turned = frame.yaw - target.pose.yaw
+        turned = frame.yaw - pose.yaw
         for axis, angle in ((0, 0.0), (1, math.pi / 2)):
             yield Edge(box.max[axis] - at[axis], turned + angle)
             yield Edge(at[axis] - box.min[axis], turned + angle + math.pi)
@@ -185,7 +186,7 @@ _UPRIGHT_MIN = 0.1
 plane no longer maps to the floor."""
 
 
-PROPOSALS = 300
+PROPOSALS = 2_000
 """Ways to pick up of which a success model ranks the likeliest first."""
 DRAWN_FROM = 100
 """Ways to pick up of which one is drawn in a rollout: more would give nothing but a slower rollout."""
@@ -371,7 +372,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         """Yield samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none fits."""
         self.keep_policy()
         if self._model is not None:
-            yield from self._ranked(self._model)
+            yield from self._ranked()
             return
         yield from map(self.chosen, self._likeliest_first(self.grounded()))
 
@@ -383,17 +384,56 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         if self._model is None:
             return self.chosen((self.policy_here() if policy is None else policy).sample(rng)[0])
         context = self._context(self._model)
-        proposals = self._proposals(self._model, rng, DRAWN_FROM, context, self.policy_here())
         if isinstance(self._model, SuccessModel):
-            return self._predicted(self._model, [self._model.draw(rng, proposals, context)], context)[0]
+            return self._predicted(self._model, [self._draw(self._model, rng, context)], context)[0]
+        proposals = self._proposals(self._model, rng, DRAWN_FROM, context, self.policy_here())
         return self._predicted(self._model, proposals[:1], context)[0]
 
-    def _ranked(self, model: SuccessModel | PolarPolicy) -> Iterator[PredictedPickUpPerformable]:
-        context, policy = self._context(model), self.grounded()
-        proposals = self._proposals(model, self._rng, max(PROPOSALS, self.samples), context, policy)
-        rate = model.probability if isinstance(model, SuccessModel) else model.likelihood
-        best = np.argsort(-rate(proposals, context), kind="stable")[: self.samples]
-        yield from self._predicted(model, [proposals[number] for number in best], context)
+    def _draw(self, model: SuccessModel, rng: np.random.Generator, context: PickUpContext) -> PickUpChoice:
+        """Draw among the proposals until, where collisions count, the base is clear."""
+        proposals = self._lifted(self.policy_here().sample(rng, DRAWN_FROM), rng, context)
+        clearance = base_clearance()
+        for _ in range(DRAWN_FROM):
+            choice = model.draw(rng, proposals, context)
+            if clearance is None or self.is_clear(choice, clearance):
+                return choice
+        raise self._nowhere()
+
+    def _ranked(self) -> Iterator[MoveAndPickUpPerformable]:
+        choices, rates = self.rated(max(PROPOSALS, self.samples))
+        clearance = base_clearance()
+        clear = (
+            choices[number]
+            for number in np.argsort(-rates, kind="stable").tolist()
+            if clearance is None or self.is_clear(choices[number], clearance)
+        )
+        first = next(clear, None)
+        if first is None:
+            raise self._nowhere()
+        for choice in islice(chain([first], clear), self.samples):
+            yield self.way(choice)
+
+    def rated(self, count: int) -> tuple[Sequence[PickUpChoice], Floats]:
+        """Draw ways to pick up at free places, and rate each: a model's probability, or a policy's density.
+
+        Where collisions count, the base may collide at its heading there (`is_clear`). Raises `ObjectUnreachable`.
+        """
+        policy, model = self.grounded(), self._model
+        if model is None:
+            samples = policy.sample(self._rng, count)
+            return samples, policy.likelihood(samples)
+        context = self._context(model)
+        if isinstance(model, PolarPolicy):
+            proposals = self._proposals(model, self._rng, count, context, policy)
+            return proposals, model.likelihood(proposals, context)
+        choices = self._lifted(policy.sample(self._rng, count), self._rng, context)
+        return choices, model.probability(choices, context)
+
+    def way(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
+        """Return the action for this choice, with the prediction of a model."""
+        if self._model is None:
+            return self.chosen(choice)
+        return self._predicted(self._model, [choice], self._context(self._model))[0]
 
     def _context(self, model: SuccessModel | PolarPolicy) -> PickUpContext:
         robot = objects.require_robot()
@@ -412,11 +452,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     ) -> Sequence[PickUpChoice]:
         """Return ways to pick up at places of `policy`, the default policy here. Raises `ObjectUnreachable`."""
         if isinstance(model, SuccessModel):
-            choices = self._clear_choices(lambda number: policy.sample(rng, number), count)
-            if context.torso_limits is None:
-                return choices
-            torsos = rng.uniform(*context.torso_limits, len(choices)).tolist()
-            return [each._replace(torso=torso) for each, torso in zip(choices, torsos, strict=True)]
+            return self._lifted(self._clear_choices(lambda number: policy.sample(rng, number), count), rng, context)
 
         def draw(number: int) -> list[PickUpChoice]:
             drawn = model.sample(rng, number, context, policy.evidence)
@@ -429,6 +465,16 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         except ImpossibleCondition as impossible:
             message = f"the policy has no way to pick up {self.target.name} here: {impossible}"
             raise ObjectUnreachable(message, self.target.name) from impossible
+
+    @staticmethod
+    def _lifted(
+        choices: Sequence[PickUpChoice], rng: np.random.Generator, context: PickUpContext
+    ) -> Sequence[PickUpChoice]:
+        """Return the choices, each with a random height of the torso, if there is one to lift."""
+        if context.torso_limits is None:
+            return choices
+        torsos = rng.uniform(*context.torso_limits, len(choices)).tolist()
+        return [each._replace(torso=torso) for each, torso in zip(choices, torsos, strict=True)]
 
     def _predicted(
         self, model: SuccessModel | PolarPolicy, choices: Sequence[PickUpChoice], context: PickUpContext
@@ -494,9 +540,12 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             if len(clear) >= count:
                 break
         if not clear:
-            message = f"the base would be in collision at every place to pick up {self.target.name}"
-            raise ObjectUnreachable(message, self.target.name)
+            raise self._nowhere()
         return clear[:count]
+
+    def _nowhere(self) -> ObjectUnreachable:
+        message = f"the base would be in collision at every place to pick up {self.target.name}"
+        return ObjectUnreachable(message, self.target.name)
 
     def is_clear(self, choice: PickUpChoice, clearance: BaseClearance) -> bool:
         """Return whether the base is clear of obstacles at its place, before and after it turns to the object."""

@@ -21,16 +21,20 @@ Descriptions with alternatives are in `actions`.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Iterator, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass, field
-from typing import ClassVar, TypeAlias, TypeVar
+from functools import partial
+from typing import ClassVar, Protocol, TypeAlias, TypeVar
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import failures, geometry, objects
 from pycrorm_async.plan.failures import arms
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.language import ActionAbstract, ActionDescription
-from pycrorm_async.plan.locations import CostmapLocation
+from pycrorm_async.plan.locations import CostmapLocation, Location, LocationDesignator
 from pycrorm_async.plan.motions import (
     ClosingMotion,
     DetectingMotion,
@@ -431,12 +435,35 @@ class DetectActionPerformable(CheckedAction):
         return await DetectingMotion(self.object_designator.object_type).perform()
 
 
+class TransportWays(Protocol):
+    """A source of ways to fetch an object and to place it; `learning.TransportPolicy` takes them from experience."""
+
+    def fetching(
+        self, target: objects.ObjectDesignator | Object, arms: Sequence[Arms], goal: Pose
+    ) -> AsyncIterator[MoveAndPickUpPerformable]:
+        """Iterate over ways to pick up the object so that it can be placed at the goal, the likeliest first."""
+        ...
+
+    def placing(self, held: objects.ObjectDesignator | Object, arm: Arms, goal: Pose) -> LocationDesignator:
+        """Return the places, with heights of the torso, from which the arm places the held object, likeliest first."""
+        ...
+
+
+@dataclass
+class _Way:
+    """The way that a `TransportWays` has chosen: the pick-up, and the next place for placing that was not tried yet."""
+
+    fetch: MoveAndPickUpPerformable | None
+    next_place: Callable[[], Location | None]
+
+
 @dataclass
 class TransportActionPerformable(CheckedAction):
-    """Pick up an object from the front with one arm and place it at `target_location`; arms are parked while driving.
+    """Pick up an object with one arm and place it at `target_location`; arms are parked while driving.
 
-    The action searches its base poses itself (`CostmapLocation`), with the torso as it is. An object that the arm
-    already holds is only delivered.
+    The action searches its base poses itself (`CostmapLocation`), with the torso as it is, and picks up from the front.
+    One of a `TransportAction` with a policy picks up and places in the ways that the policy chose. An object that the
+    arm already holds is only delivered.
 
     Raises:
         ObjectUnfetchable: no base pose allows the pick-up.
@@ -452,6 +479,7 @@ class TransportActionPerformable(CheckedAction):
     object_designator: objects.ObjectDesignator | Object
     arm: Arms
     target_location: Pose
+    _way: _Way | None = field(default=None, repr=False, compare=False)
 
     def resources(self) -> frozenset[failures.Resource]:
         return failures.reaching(Arms.BOTH)
@@ -462,17 +490,32 @@ class TransportActionPerformable(CheckedAction):
         target = objects.in_world(self.object_designator)
         geometry.check_takable(robot, self.arm, target)
         is_held = robot.body.attachments.get(target) == tool_frame
-        if collisions_count() and not is_held:
+        fetch = self._way.fetch if self._way is not None else None
+        if collisions_count() and not is_held and fetch is None:
             geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, Grasp.FRONT))
         await self._park_arms()
         if not is_held:
-            await self._drive(self._fetching_pose(robot.body))
-            await PickUpActionPerformable(self.object_designator, self.arm, Grasp.FRONT).perform()
+            if fetch is not None:
+                await fetch.perform()
+            else:
+                await self._drive(self._fetching_pose(robot.body))
+                await PickUpActionPerformable(self.object_designator, self.arm, Grasp.FRONT).perform()
             await self._park_arms()
-        place = CostmapLocation(self.target_location, reachable_for=robot.body, reachable_arm=self.arm).resolve()
+        place = self._placing_place(robot.body)
+        if place.torso_height is not None:
+            await MoveTorsoActionPerformable(place.torso_height).perform()
         await self._drive(place.pose)
         await PlaceActionPerformable(self.object_designator, self.arm, self.target_location).perform()
         await self._park_arms()
+
+    def _placing_place(self, body: Object) -> Location:
+        if self._way is None:
+            return CostmapLocation(self.target_location, reachable_for=body, reachable_arm=self.arm).resolve()
+        place = self._way.next_place()
+        if place is None:
+            message = f"there is no other place to stand and reach {self.target_location}"
+            raise failures.ReachabilityFailure(message, self.target_location)
+        return place
 
     async def _park_arms(self) -> None:
         """Park every arm that has a park posture."""
@@ -620,12 +663,23 @@ class DetectAction(ActionDescription[DetectActionPerformable]):
 
 
 class TransportAction(ActionDescription[TransportActionPerformable]):
-    """Fetch an object and place it at one of these poses."""
+    """Fetch an object and place it at one of these poses.
+
+    With a `policy`, `async for` and `Retry` get its ways to fetch the object with one of the arms, the likeliest first;
+    each alternative is another way, and delivers an object that an earlier one has picked up.
+
+    >>> ways = TransportPolicy(model)  # of pycrorm_async.learning
+    >>> await Retry(TransportAction(milk, [Arms.LEFT, Arms.RIGHT], [place], policy=ways), max_tries=5).perform()
+    """
 
     _lifting = "arm", "object_designator"
 
     def __init__(
-        self, object_designator_description: Objects, arms: OneOrMore[Arms], target_locations: OneOrMore[Pose]
+        self,
+        object_designator_description: Objects,
+        arms: OneOrMore[Arms],
+        target_locations: OneOrMore[Pose],
+        policy: TransportWays | None = None,
     ) -> None:
         super().__init__(
             TransportActionPerformable,
@@ -633,3 +687,59 @@ class TransportAction(ActionDescription[TransportActionPerformable]):
             arm=arms,
             target_location=target_locations,
         )
+        self._policy = policy
+
+    def resolve(self) -> TransportActionPerformable:
+        """Return the first alternative; with a policy a coroutine of it. Raises what the iteration raises."""
+        return self._first() if self._policy is not None else super().resolve()  # type: ignore[return-value]
+
+    async def _first(self) -> TransportActionPerformable:
+        async with aclosing(self.__aiter__()) as alternatives:
+            return await anext(alternatives)
+
+    def __iter__(self) -> Iterator[TransportActionPerformable]:
+        """Yield every combination. Raises `CallerError` with a policy, which may query the memory in between."""
+        if self._policy is not None:
+            raise CallerError("a transport with a policy may query a memory: iterate with `async for`")
+        return super().__iter__()
+
+    async def __aiter__(self) -> AsyncGenerator[TransportActionPerformable, None]:
+        """Yield what the policy chooses for each object and place; without one, every combination."""
+        if self._policy is None:
+            for each in super().__iter__():
+                yield each
+            return
+        among, arms, goals = (self._choices(name, each) for name, each in self._alternatives.items())
+        for target, goal in itertools.product(among, goals):
+            async for each in self._chosen(self._policy, target, arms, goal):
+                yield each
+
+    async def _chosen(
+        self, policy: TransportWays, target: objects.ObjectDesignator | Object, arms: Sequence[Arms], goal: Pose
+    ) -> AsyncGenerator[TransportActionPerformable, None]:
+        """Yield the ways to fetch one object for one place, and while it is held, to place it."""
+        places: dict[Arms, Iterator[Location]] = {}
+        exhausted: set[Arms] = set()
+
+        def next_place(arm: Arms) -> Location | None:
+            if arm not in places:
+                places[arm] = iter(policy.placing(target, arm, goal))
+            place = next(places[arm], None)
+            if place is None:
+                exhausted.add(arm)
+            return place
+
+        ways = policy.fetching(target, arms, goal)
+        while (arm := _holding(target)) not in exhausted:
+            way = await anext(ways, None) if arm is None else None
+            arm = arm if way is None else way.arm
+            if arm is None:
+                return
+            yield TransportActionPerformable(target, arm, goal, _Way(way, partial(next_place, arm)))
+
+
+def _holding(target: objects.ObjectDesignator | Object) -> Arms | None:
+    """Return the arm that holds the object; None if none does."""
+    body, description = objects.require_robot()
+    link = body.attachments.get(objects.in_world(target))
+    return next((arm for arm, each in description.arms.items() if each.tool_frame == link), None)

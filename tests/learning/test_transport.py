@@ -1,0 +1,108 @@
+"""Transports in the ways that experience prefers: an end in mind, nothing impossible tried, every try another way."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from bench import tasks
+from pycrorm_async import Memory
+from pycrorm_async.errors import CallerError
+from pycrorm_async.learning import Disturbance, TransportPolicy
+from pycrorm_async.learning.transport import held_grasp
+from pycrorm_async.orm import TransportAction as TransportRow
+from pycrorm_async.plan import (
+    PickUpActionPerformable,
+    PlanFailure,
+    Retry,
+    TransportAction,
+)
+from pycrorm_async.plan.failures import ReachabilityFailure
+from pycrorm_async.plan.objects import require_robot
+from pycrorm_async.plan.task import collected_tree
+from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world import Arms, Pose
+
+pytestmark = pytest.mark.slow
+
+ARMS = [Arms.LEFT, Arms.RIGHT]
+SOLVABLE = (0, 4, 8)
+"""Tasks of seed 69 that have many solutions."""
+
+
+def policy(number: int = 0, **options: Any) -> TransportPolicy:
+    return TransportPolicy(rng=np.random.default_rng((69, number, 3)), **options)
+
+
+async def test_what_is_picked_up_is_placed_and_nothing_fails_on_the_way(tmp_path: Path) -> None:
+    with tasks.kitchen(Disturbance()) as here:
+        async with Memory.open(f"sqlite:///{tmp_path}/tasks.db") as memory:
+            for number in SOLVABLE:
+                thing, goal = here.prepare(69, number)
+                async with memory.episode(description="task"):
+                    with collected_tree() as tree:
+                        transport = await TransportAction(thing, ARMS, [goal], policy=policy(number)).resolve()  # type: ignore[misc]
+                        await transport.perform()
+                np.testing.assert_allclose(thing.pose.position, goal.position, atol=1e-6)
+                assert abs(np.dot(thing.pose.orientation, goal.orientation)) == pytest.approx(1, abs=1e-6)
+                assert {each.status for each in tree} == {TaskStatus.SUCCEEDED}
+            await memory.flush()
+            async with memory.session() as session:
+                assert len((await session.scalars(select(TransportRow))).all()) == len(SOLVABLE)
+
+
+async def test_a_task_ends_the_same_in_any_order_and_world() -> None:
+    def ends(numbers: list[int]) -> dict[int, Any]:
+        return dict(zip(numbers, tasks.in_process("random, checked", None, tasks.ERRORS, 69, numbers), strict=True))
+
+    forth, back = [await asyncio.to_thread(ends, each) for each in ([0, 1, 2, 4], [4, 2, 1, 0])]
+    assert forth == back
+    assert any(each.placed for each in forth.values())
+
+
+async def test_the_next_try_delivers_what_is_held_from_another_place() -> None:
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 4)
+        way = await anext(policy(4).fetching(thing, ARMS, goal))
+        await way.perform()
+        places, reached = [], False
+        async for each in TransportAction(thing, ARMS, [goal], policy=policy(4, checked=False)):
+            assert each.arm is way.arm
+            with collected_tree() as tree, suppress(PlanFailure):
+                await each.perform()
+                reached = True
+            assert not [node for node in tree if isinstance(node.designator, PickUpActionPerformable)]
+            places.append(here.robot.pose)
+            if reached or len(places) == 4:
+                break
+        assert len(places) > 1
+        assert len(set(places)) == len(places)
+
+
+async def test_a_policy_is_asked_with_async_for_and_says_so() -> None:
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 4)
+        with pytest.raises(CallerError, match="iterate with `async for`"):
+            next(iter(TransportAction(thing, ARMS, [goal], policy=policy())))
+        with pytest.raises(PlanFailure, match="no alternative"):  # the goal is out of reach for any arm
+            await Retry(TransportAction(thing, ARMS, [Pose((0, 0, 3))], policy=policy()), max_tries=2).perform()
+        with pytest.raises(ReachabilityFailure, match="no place to stand and place"):
+            policy().placing(thing, Arms.LEFT, Pose((0, 0, 3))).resolve()
+
+
+async def test_the_grasp_of_a_held_object_is_known_from_the_hand() -> None:
+    grasps = set()
+    with tasks.kitchen(Disturbance()) as here:
+        for number in SOLVABLE:
+            thing, goal = here.prepare(69, number)
+            way = await anext(policy(number).fetching(thing, ARMS, goal))
+            await way.perform()
+            assert held_grasp(require_robot(), way.arm, thing) is way.grasp
+            grasps.add(way.grasp)
+    assert len(grasps) > 1
