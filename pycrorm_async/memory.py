@@ -60,7 +60,7 @@ from pycrorm_async.record.event_feed import BUFFER_EVENTS, EventStream, Recorded
 from pycrorm_async.record.opening import PlanSource, Provenance, read_labels
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings, Writer
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import DatabaseAddress, check_replica
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.plan_writer import DelegatedWriter, WriterThread
 
@@ -148,8 +148,10 @@ class Memory:
         settings: Settings,
         clock: Clock,
         plan_source: PlanSource | None = None,
+        replica: DatabaseAddress | None = None,
     ) -> None:
         self._address = self._located = address
+        self._replica = replica
         self._spool = spool
         self._views = tuple(views)
         self._projections = tuple(projections)
@@ -179,6 +181,7 @@ class Memory:
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
         plan_source: PlanSource | None = None,
+        read_url: str | None = None,
     ) -> Memory:
         """Return a memory to enter with `async with`, once.
 
@@ -196,13 +199,18 @@ class Memory:
                 query.
             settings, clock: limits and intervals; the time source.
             plan_source: recorded with each episode; `pycrorm run` passes hash and commit of the plan's file.
+            read_url: a streaming replica of the PostgreSQL server, which answers the questions. After a flush they wait
+                up to 5 s until it shows what was flushed; while it does not, the memory itself answers, with a warning.
 
         Raises:
             UnknownUrl: at once. `CallerError`: at once, for a private database, or views or projections of this
-                process, with a daemon or a process.
+                process, with a daemon or a process, and for a `read_url` that cannot be a replica.
                 On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`, `SpoolForeign`.
         """
         address, settings = DatabaseAddress.parse(url), settings or Settings()
+        replica = DatabaseAddress.parse(read_url) if read_url else None
+        if replica is not None:
+            check_replica(replica, address)
         keep_s = 0.0 if address.is_private else settings.keep_stored_s  # sqlite:// is never restored
         settings = replace(settings, writer=writer or settings.writer, keep_stored_s=keep_s)
         if settings.writer != "thread":
@@ -224,6 +232,7 @@ class Memory:
             settings=settings,
             clock=clock,
             plan_source=plan_source,
+            replica=replica,
         )
 
     @classmethod
@@ -236,6 +245,7 @@ class Memory:
         projections: Sequence[Projection] = (),
         writer: Writer | None = None,
         settings: Settings | None = None,
+        read_url: str | None = None,
     ) -> Memory:
         """Open a memory for all contexts of this process that have none of their own, until `close`; see `open`.
 
@@ -244,7 +254,15 @@ class Memory:
         memories are connected, the last one records. Events that are not stored when the process ends without `close`
         stay in the spool, and the next memory of that database stores them.
         """
-        memory = cls.open(url, spool=spool, views=views, projections=projections, writer=writer, settings=settings)
+        memory = cls.open(
+            url,
+            spool=spool,
+            views=views,
+            projections=projections,
+            writer=writer,
+            settings=settings,
+            read_url=read_url,
+        )
         return await memory._enter(Parts.in_process)  # noqa: SLF001  its own class
 
     @classmethod
@@ -347,6 +365,7 @@ class Memory:
             if unreported is not None:
                 raise unreported from fault
         if parts.made_reading is not None and parts.made_reading.is_open:
+            await parts.made_reading.follow()
             await parts.made_reading.refresh(maps=False)
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
@@ -677,7 +696,7 @@ class Memory:
         recording = Recording(
             emitter, episodes, known, declared, software=__version__, provenance=provenance, stored_episodes=stored
         )
-        parts = Parts(address, queue, writer, recording, self._clock, process)
+        parts = Parts(address, queue, writer, recording, self._clock, process, self._replica)
         self._stack.push_async_callback(parts.close_reading)
         return parts
 

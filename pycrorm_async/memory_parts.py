@@ -56,6 +56,7 @@ class Parts:
         recording: Recording,
         clock: Clock,
         process: WriterProcess | None = None,
+        replica: DatabaseAddress | None = None,
     ) -> None:
         self.queue = queue
         self.writer = writer
@@ -68,6 +69,7 @@ class Parts:
         self._made_recall: Recall | None = None
         self._made_experience: PickUpExperience | None = None
         self._address = address
+        self._replica = replica
         self._clock = clock
         self._lock = threading.RLock()  # a finalizer may read a part while this thread makes one
 
@@ -86,7 +88,7 @@ class Parts:
         if self.made_reading is None:
             with self._lock:
                 if self.made_reading is None:
-                    self.made_reading = reading_side.Reading(self._address)
+                    self.made_reading = reading_side.Reading(self._address, replica=self._replica, follows=True)
         return self.made_reading
 
     @property

@@ -97,6 +97,10 @@ class Replicas:
     def url(self, database: str = "postgres") -> str:
         return f"postgresql://postgres@/{database}?host={self._address}"
 
+    def standby_url(self, database: str = "postgres") -> str:
+        assert self._standby is not None
+        return f"postgresql://postgres@/{database}?host={self._standby}"
+
     def follow(self) -> None:
         """Make a new standby of the primary, as a copy that follows it."""
         standby = self._standby = self._copied(self._primary)
@@ -115,6 +119,13 @@ class Replicas:
         assert self._standby is not None
         self._set(self._standby, "primary_conninfo", "")
         self._until(self._standby, "SELECT count(*) = 0 FROM pg_stat_wal_receiver")
+
+    def stop_primary(self) -> None:
+        """Crash the primary, and leave the standby as it is."""
+        self._stop(self._primary)
+
+    def start_primary(self) -> None:
+        self._start(self._primary)
 
     def fail_over(self) -> None:
         """Crash the primary, promote the standby, and move the address to it."""

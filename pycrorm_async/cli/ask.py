@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.output import Form, moment, note, parse_since, print_line, print_rows, print_table
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.query.question import Question
 from pycrorm_async.query.questions import QUESTIONS, Argument, Ask, arguments_of
 from pycrorm_async.query.reading import Reading
@@ -30,7 +30,7 @@ def _verb(name: str) -> Callable[..., None]:
         *,
         sql: bool,
         simulated: bool,
-        place: Place,
+        place: ReadingPlace,
         form: Form,
         **options: Any,
     ) -> None:
@@ -38,14 +38,14 @@ def _verb(name: str) -> Callable[..., None]:
             key: parse_since(value) if key == "since" else value for key, value in options.items() if value is not None
         }
         if sql:
-            print_line(getattr(Reading(place.address).ask, name)(**arguments).sql)
+            print_line(getattr(Reading(place.place.address).ask, name)(**arguments).sql)
             return
         _answer(name, arguments, place, form, simulated=simulated)
 
     options = {each.name: (_option(each), each.default) for each in arguments_of(name).values()} | {
         "sql": (_SqlOption, False),
         "simulated": (_SimulatedOption, False),
-        "place": (Place, inspect.Parameter.empty),
+        "place": (ReadingPlace, inspect.Parameter.empty),
         "form": (Form, inspect.Parameter.empty),
     }
     parameters = [
@@ -68,7 +68,7 @@ def _option(argument: Argument) -> Any:
     return Annotated[type_ if argument.is_required else type_ | None, typer.Option(*flags, help=argument.help)]
 
 
-def _answer(name: str, arguments: dict[str, Any], place: Place, form: Form, *, simulated: bool) -> None:
+def _answer(name: str, arguments: dict[str, Any], place: ReadingPlace, form: Form, *, simulated: bool) -> None:
     async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
         question: Question = getattr(reading.ask, name)(**arguments)
         rows, unknown = await question.rows_or_unknown_name(simulated=simulated)

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.output import Form, counted, note, print_json, print_line, print_table, stdout
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.episode_diff import Parting, partings
 from pycrorm_async.query.named_queries import EpisodeSummary
@@ -24,7 +24,7 @@ _HELP = "The episode's number, its id or first digits of the id, or `last`."
 def diff(
     first: Annotated[str, typer.Argument(metavar="A", help=_HELP)],
     second: Annotated[str, typer.Argument(metavar="B", help=_HELP)],
-    place: Place,
+    place: ReadingPlace,
     form: Form,
     others: Annotated[
         list[str] | None, typer.Argument(metavar="[C]...", help="More episodes: list the nodes at which all part.")

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli import output
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.cli.show import simulated_by
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import absence_of_episodes
@@ -27,7 +27,7 @@ to spare."""
 
 def episodes(
     *,
-    place: Place,
+    place: ReadingPlace,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Also list simulated episodes (SimulatedTaskTree).")
     ] = False,
@@ -74,7 +74,7 @@ def episodes(
     if simulated:
         columns = (*columns, "simulated")
         rows = [(*row, simulated_by(e) if e.simulated else "") for row, e in zip(rows, summaries, strict=True)]
-    output.print_table(f"Episodes of {place.address}", columns, rows, as_csv=form.as_csv)
+    output.print_table(f"Episodes of {place.place.address}", columns, rows, as_csv=form.as_csv)
 
 
 def _took(episode: EpisodeSummary, form: output.Form) -> object:

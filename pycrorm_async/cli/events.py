@@ -14,10 +14,10 @@ import msgspec
 import typer
 
 from pycrorm_async.cli.output import EpisodeArgument, JsonOption
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError, LogDamaged
 from pycrorm_async.events.types import EVENT_TYPES
-from pycrorm_async.store.log import EventLog, episode_named
+from pycrorm_async.store.log import episode_named
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.visible_text import escaped_json
 
@@ -29,7 +29,7 @@ def events(
     event_types: Annotated[
         list[str] | None, typer.Option("--type", help="Print only events of this type; repeatable.")
     ] = None,
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,  # noqa: ARG001  the output is always JSON
 ) -> None:
     """Print the events of an episode in their order, one JSON object per line."""
@@ -38,12 +38,12 @@ def events(
         raise CallerError(f"unknown event type {unknown[0]!r}; known types: {', '.join(sorted(EVENT_TYPES))}")
     asyncio.run(_print(place, episode, after, frozenset(event_types or ())))
     sys.stdout.flush()
-    place.note_pending_events()
+    place.place.note_pending_events()
 
 
-async def _print(place: Place, episode: str, after: int, event_types: frozenset[str]) -> None:
+async def _print(place: ReadingPlace, episode: str, after: int, event_types: frozenset[str]) -> None:
     """Print the events of these types; without one print all, also those of a type that this version does not know."""
-    log = await EventLog.open(place.shared_address, create=False)
+    log = await place.open_log()
     try:
         row = await episode_named(log, episode)
         async for page in log.pages(row, after=after):

@@ -15,7 +15,7 @@ import typer
 
 from pycrorm_async.cli import output
 from pycrorm_async.cli.interruption import interrupt_on_termination
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import ExportComparison, Exported, export_again, format_named, format_of
 from pycrorm_async.export.export import export as write_export
@@ -85,7 +85,7 @@ def export(
         bool, typer.Option("--no-formulas", help="Of csv: an apostrophe before each text that a spreadsheet would run.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the file and its manifest if they exist.")] = False,
-    place: Place,
+    place: ReadingPlace,
     as_json: output.JsonOption = False,
 ) -> int:
     """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again.
@@ -115,7 +115,7 @@ def export(
     options["arguments"] = _arguments(what[0], arguments or []) if what else {}
 
     async def write(report_progress: ProgressCallback | None) -> Exported:
-        async with Reading.open(place.url) as reading:
+        async with Reading.open(place.url, read_url=place.read_url) as reading:
             chosen = episode or []
             if choice != EpisodeChoice():
                 chosen = [str(each.number) for each in await reading.episodes(choice) if each.status != "RUNNING"]
@@ -129,7 +129,7 @@ def export(
     interrupt_on_termination()
     with progress_bar("exporting", unit=_unit(file_format or format_of(out))) as report_progress:
         exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
-    place.note_pending_events()
+    place.place.note_pending_events()
     _print(exported, as_json=as_json)
     for number, reason in exported.unreadable.items():
         output.problem(f"episode {number} is not in it: {reason}")
@@ -158,15 +158,15 @@ def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
     return arguments
 
 
-def _again(manifest: Path, out: Path | None, place: Place, *, force: bool, as_json: bool) -> int:
+def _again(manifest: Path, out: Path | None, place: ReadingPlace, *, force: bool, as_json: bool) -> int:
     async def write(report_progress: ProgressCallback | None) -> ExportComparison:
-        async with Reading.open(place.url) as reading:
+        async with Reading.open(place.url, read_url=place.read_url) as reading:
             return await export_again(reading, manifest, out, force=force, report_progress=report_progress)
 
     interrupt_on_termination()
     with progress_bar("exporting", unit=_unit(read_manifest(manifest).file_format)) as report_progress:
         comparison = asyncio.run(write(report_progress if stderr.is_terminal else None))
-    place.note_pending_events()
+    place.place.note_pending_events()
     if as_json:
         file = comparison.exported and out
         outcome = {"same": comparison.same, "by_bytes": comparison.by_bytes, "differences": comparison.differences}

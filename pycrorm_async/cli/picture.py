@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.output import EpisodeArgument, JsonOption, parse_size, print_json, print_line
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.picture import picture as draw
 from pycrorm_async.query.reading import Reading
@@ -43,7 +43,7 @@ def picture(
         typer.Option(metavar="DEGREES", help="Look from this side, 0 from +x, 90 from +y; default: the best view."),
     ] = None,
     pitch: Annotated[float, typer.Option(metavar="DEGREES", help="Look from this angle above the scene.")] = 32.0,
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,
 ) -> None:
     """Write the scene at a moment as PNG, drawn from the recorded geometry without a display."""

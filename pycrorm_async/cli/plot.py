@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.output import JsonOption, note, print_json, print_line
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.success import Kind, SuccessTable, success_figure, success_samples, success_table
 from pycrorm_async.report.output_files import refuse_existing, write_file
@@ -41,7 +41,7 @@ def plot(
         "success.png"
     ),
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,
 ) -> None:
     """Draw how often actions succeeded over two columns of a view: where, with which arm, how long.

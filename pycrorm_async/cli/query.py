@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from pycrorm_async.cli.output import Form, counted, csv_cell, note, print_rows
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.sql import SqlLimits, SqlResult, json_rows
@@ -34,7 +34,7 @@ def query(
     ] = _ROWS,
     megabytes: Annotated[float, typer.Option(metavar="MB", help="Return at most this size of rows.")] = 16.0,
     seconds: Annotated[float, typer.Option(metavar="S", help="Time that the database may take.")] = 10.0,
-    place: Place,
+    place: ReadingPlace,
     form: Form,
 ) -> None:
     """Run one read-only query in SQL: no statement can change the memory or the machine.

@@ -11,10 +11,11 @@ import typer
 
 from pycrorm_async.cli.output import note
 from pycrorm_async.queue.spool import Spool
-from pycrorm_async.store.address import DatabaseAddress, shared_address
+from pycrorm_async.store.address import DatabaseAddress, check_replica, shared_address
 
 if TYPE_CHECKING:
     from pycrorm_async.query.reading import Reading
+    from pycrorm_async.store.log import EventLog
 
 T = TypeVar("T")
 
@@ -38,6 +39,16 @@ SpoolOption = Annotated[
 ]
 
 
+ReadUrlOption = Annotated[
+    str | None,
+    typer.Option(
+        "--read-url",
+        envvar="PYCRORM_READ_URL",
+        help="A streaming replica of the PostgreSQL server, which answers in its place; a line says when it is behind.",
+    ),
+]
+
+
 class Place(NamedTuple):
     """The memory that a verb opens: the URL of its database, and the folder of its write-ahead queue."""
 
@@ -53,19 +64,6 @@ class Place(NamedTuple):
     def shared_address(self) -> DatabaseAddress:
         """The address. Raises `CallerError` for `sqlite://`, as every verb that opens the memory of another process."""
         return shared_address(self.url)
-
-    def read(self, read: Callable[[Reading], Awaitable[T]]) -> T:
-        """Open the memory, call `read` with it, and return the result; then note pending events."""
-        from pycrorm_async.query.reading import Reading  # loads the mapped classes, which not every verb needs
-
-        async def run() -> T:
-            async with Reading.open(self.url) as reading:
-                return await read(reading)
-
-        shared_address(self.url)
-        answer = asyncio.run(run())
-        self.note_pending_events()
-        return answer
 
     def note_pending_events(self) -> None:
         """Print a line on stderr for dead recorders with events left to store, and one for living recorders.
@@ -84,3 +82,44 @@ class Place(NamedTuple):
             )
         if alive:
             note(f"{alive} recorder{'s are' if alive > 1 else ' is'} running: the latest events may not be stored yet.")
+
+
+class ReadingPlace(NamedTuple):
+    """The memory that a verb reads: a `Place`, and the replica that answers instead of its database."""
+
+    url: UrlOption = DEFAULT_URL
+    spool: SpoolOption = None
+    read_url: ReadUrlOption = None
+
+    @property
+    def place(self) -> Place:
+        """The memory itself."""
+        return Place(self.url, self.spool)
+
+    @property
+    def replica(self) -> DatabaseAddress | None:
+        """The address of the replica. Raises `CallerError` if it can be none of this database."""
+        if not self.read_url:
+            return None
+        replica = DatabaseAddress.parse(self.read_url)
+        check_replica(replica, self.place.address)
+        return replica
+
+    def read(self, read: Callable[[Reading], Awaitable[T]]) -> T:
+        """Open the memory, call `read` with it, and return the result; then note pending events."""
+        from pycrorm_async.query.reading import Reading  # loads the mapped classes, which not every verb needs
+
+        async def run() -> T:
+            async with Reading.open(self.url, read_url=self.read_url) as reading:
+                return await read(reading)
+
+        shared_address(self.url)
+        answer = asyncio.run(run())
+        self.place.note_pending_events()
+        return answer
+
+    async def open_log(self) -> EventLog:
+        """Open the log for reading."""
+        from pycrorm_async.store.replica import open_to_read
+
+        return await open_to_read(self.place.shared_address, self.replica)

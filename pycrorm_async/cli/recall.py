@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from pycrorm_async.cli.output import Form, note, print_rows, print_table, stdout
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase
@@ -59,7 +59,7 @@ def recall(
     why: Annotated[
         bool, typer.Option("--why", help="Explain each action: what is alike, what differs and by how much.")
     ] = False,
-    place: Place,
+    place: ReadingPlace,
     form: Form,
 ) -> None:
     """List the past actions most like a cue, with their outcomes."""
@@ -231,7 +231,7 @@ def _case(recalled: RecalledCase) -> dict[str, Any]:
 
 
 def _follows(
-    parsed: _Parsed, like: str | None, place: Place, form: Form, *, status: str | None, reason: str | None
+    parsed: _Parsed, like: str | None, place: ReadingPlace, form: Form, *, status: str | None, reason: str | None
 ) -> None:
     dtype = parsed.type
     if dtype is None or like is not None or any(parsed[1:]):

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli import output
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
 from pycrorm_async.report.overview import Plot, overview
@@ -57,7 +57,7 @@ def report(
             " 200; or the whole contents, up to 24 MB, and small pictures of the others."
         ),
     ] = "thumbs",
-    place: Place,
+    place: ReadingPlace,
     as_json: output.JsonOption = False,
 ) -> int:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures.
@@ -95,7 +95,7 @@ def _write_overview(
     out: Path,
     choice: EpisodeChoice,
     plots: list[Plot],
-    place: Place,
+    place: ReadingPlace,
     *,
     force: bool,
     images: Images,
@@ -124,7 +124,7 @@ def _write_episode(
     episode: str,
     out: Path | None,
     window: tuple[int | None, int | None],
-    place: Place,
+    place: ReadingPlace,
     *,
     force: bool,
     images: Images,

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import typer
 
 from pycrorm_async.cli.output import JsonOption, print_json
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
 from pycrorm_async.visible_text import visible
@@ -26,7 +26,7 @@ def schema(
         Literal["text", "mermaid"],
         typer.Option("--format", help="mermaid: a diagram, by default of the views that most queries read."),
     ] = "text",
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,
 ) -> None:
     """Describe the views of a memory: the meaning of a row, and each column with its type, unit and reference."""

@@ -15,7 +15,7 @@ from rich.text import Text
 from rich.tree import Tree
 
 from pycrorm_async.cli import output
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import BLOB_KEY
 from pycrorm_async.query import named_queries
@@ -51,7 +51,7 @@ def show(
             help="Print texts, lists, hashes and numbers in full, and all percepts and places; --json always does.",
         ),
     ] = False,
-    place: Place,
+    place: ReadingPlace,
     as_json: output.JsonOption = False,
 ) -> None:
     """Show an episode's task tree with statuses and durations; with --at, tree and world at one moment."""
@@ -61,7 +61,7 @@ def show(
         _show_moment(episode, at, place, events=events, full=full, as_json=as_json)
 
 
-def _show(episode: str, place: Place, *, events: bool, full: bool, as_json: bool) -> None:
+def _show(episode: str, place: ReadingPlace, *, events: bool, full: bool, as_json: bool) -> None:
     async def query(reading: Reading) -> tuple[named_queries.EpisodeSummary, list[named_queries.NodeSummary], _Answers]:
         summary = await reading.episode(episode)
         tree = await reading.tree(summary)
@@ -124,7 +124,7 @@ def _pairs(values: Mapping[str, object] | None) -> str | None:
     return ", ".join(f"{name} {value}" for name, value in values.items()) if values else None
 
 
-def _show_moment(episode: str, at: str, place: Place, *, events: bool, full: bool, as_json: bool) -> None:
+def _show_moment(episode: str, at: str, place: ReadingPlace, *, events: bool, full: bool, as_json: bool) -> None:
     time, sequence = parse_moment(at, "--at")
     snapshot = place.read(lambda reading: reading.as_of(episode, time=time, sequence=sequence))
     if as_json:

@@ -15,7 +15,7 @@ import msgspec
 
 from pycrorm_async import core
 from pycrorm_async.cli.output import JsonOption, moment, note, print_json, print_table, problem, stdout
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError, DatabaseForeign
 from pycrorm_async.operations.workers import DaemonNote, FoldWorkerState
@@ -33,6 +33,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.placement import PLAIN, Placement
+from pycrorm_async.store.replica import SETTLE_S, ReplicaLag, lag_between
 from pycrorm_async.store.stored import Incarnation
 
 # === durability ===============================================================================================
@@ -172,6 +173,7 @@ class DatabaseState:
         stored_on: number of machines that hold each stored event, and the names of the synchronous standbys.
         went_back: each time at which the log was noticed to have lost stored events.
         placement: that of the memory's rows.
+        replica: how far the replica is behind that `--read-url` names; None if it cannot be read, which is a warning.
     """
 
     episodes: Sequence[EpisodeState] = ()
@@ -185,9 +187,10 @@ class DatabaseState:
     went_back: Sequence[Incarnation] = ()
     are_tables_outdated: bool = False
     placement: Placement = PLAIN
+    replica: ReplicaLag | None = None
 
 
-def status(place: Place, as_json: JsonOption = False) -> int:
+def status(place: ReadingPlace, as_json: JsonOption = False) -> int:
     """Report recorders, writers, running episodes with their robots, and the lag of database and tables.
 
     Changes nothing.
@@ -195,7 +198,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
     Exit code 1 if an episode or a recorder is stopped or a designator type has no tables or a view is left out, 3
     if the database or the spool is unavailable.
     """
-    address = place.shared_address
+    address = place.place.shared_address
     spool = Spool(place.spool or address.default_spool)
     folders = spool.recorders()
     recorders = [_recorder(each) for each in folders if each.refused is None]
@@ -208,7 +211,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
     workers = _workers(spool.writer_note())
     kept, state, fault = summarise_kept_segments(spool.path), DatabaseState(), None
     try:
-        state = asyncio.run(_query(address))
+        state = asyncio.run(_query(address, place.replica))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -232,6 +235,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
                 "running_total": state.running_total,
                 "went_back": [each._asdict() for each in state.went_back],
                 "placement": state.placement.to_print(),
+                "replica": state.replica and state.replica._asdict(),
                 "core": {"compiled": core.IS_COMPILED, "reason": core.PURE_REASON},
             }
         )
@@ -243,6 +247,8 @@ def status(place: Place, as_json: JsonOption = False) -> int:
         print_durability(kept, state.stored_on, state.went_back)
         if state.placement != PLAIN:
             stdout.print(f"Placement of the memory: {state.placement}.", markup=False)
+        if state.replica is not None:
+            stdout.print(f"The replica {state.replica}.", markup=False)
         for projection in state.projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
@@ -250,7 +256,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
         for warning in state.warnings:
             note(f"warning: {warning}")
         if not has_daemon:
-            place.note_pending_events()
+            place.place.note_pending_events()
     if fault is not None:
         problem(fault)
         return 3
@@ -344,7 +350,7 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
     )
 
 
-async def _query(address: DatabaseAddress) -> DatabaseState:
+async def _query(address: DatabaseAddress, replica: DatabaseAddress | None) -> DatabaseState:
     log = await EventLog.open(address, create=False)
     try:
         rows = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
@@ -360,6 +366,7 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
             )
         running, running_total = await _running(log)
         outdated = await _outdated(log)
+        lag, unread = await _lag(log, replica)
         return DatabaseState(
             episode_states,
             running,
@@ -370,6 +377,7 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
                 *await log.limits_near(),
                 *await _left_out_of_recall(log),
                 *await generations.contradictions(log),
+                *unread,
             ],
             await generations.unmade_types(log),
             await failed_views(log),
@@ -377,9 +385,24 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
             await log.incarnations(),
             bool(outdated),
             await log.placement(),
+            lag,
         )
     finally:
         await log.close()
+
+
+async def _lag(log: EventLog, address: DatabaseAddress | None) -> tuple[ReplicaLag | None, list[str]]:
+    """Return how far the replica is behind, and a line if it cannot be read."""
+    if address is None:
+        return None, []
+    try:
+        replica = await EventLog.open(address, create=False)
+    except DatabaseError as fault:
+        return None, [f"the replica cannot be read: {fault}"]
+    try:
+        return await lag_between(replica, log, SETTLE_S), []
+    finally:
+        await replica.close()
 
 
 async def _outdated(log: EventLog) -> list[str]:

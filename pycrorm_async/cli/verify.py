@@ -16,14 +16,14 @@ import typer
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.output import JsonOption, ProjectionOption, counted, note, print_json, stdout
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.projections.custom import Projection, installed_projections, load_projections
 from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.verify import OutsideDigest
 from pycrorm_async.projections.verify import verify as verify_log
-from pycrorm_async.store.log import EventLog, episode_named
+from pycrorm_async.store.log import episode_named
 
 _FINDINGS_MAX = 20
 """Bounds the printed findings of each kind; the rest is only counted."""
@@ -34,7 +34,7 @@ def verify(
     episode: Annotated[
         str | None, typer.Option("--episode", help="Verify only this episode: its number, its id, or `last`.")
     ] = None,
-    place: Place,
+    place: ReadingPlace,
     digests: Annotated[
         Path | None,
         typer.Option(
@@ -59,7 +59,7 @@ def verify(
     projections = [*given_projections, *installed_projections(given_projections)]
     collect_seldom()
     result, ids = asyncio.run(_verify(place, episode, projections, outside))
-    place.note_pending_events()
+    place.place.note_pending_events()
     for name, reason in result.not_compared.items():
         note(f"the projection {name} was not verified: {reason}")
     if as_json:
@@ -98,9 +98,9 @@ def _read_digests(path: Path) -> list[OutsideDigest]:
 
 
 async def _verify(
-    place: Place, episode: str | None, projections: Sequence[Projection], digests: Sequence[OutsideDigest]
+    place: ReadingPlace, episode: str | None, projections: Sequence[Projection], digests: Sequence[OutsideDigest]
 ) -> tuple[VerifyResult, dict[int, str]]:
-    log = await EventLog.open(place.shared_address, create=False)
+    log = await place.open_log()
     try:
         only = None if episode is None else await episode_named(log, episode)
         with progress_bar("verifying") as report_progress:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import logging
 import re
 import sys
 import threading
@@ -22,10 +23,23 @@ from datetime import datetime
 from functools import partial
 from shlex import quote
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar, overload
 from weakref import ref
 
-from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event, func, select
+from sqlalchemy import (
+    BinaryExpression,
+    ColumnElement,
+    Connection,
+    Dialect,
+    Result,
+    Row,
+    Select,
+    event,
+    func,
+    literal,
+    select,
+    table,
+)
 from sqlalchemy.dialects import registry
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
@@ -42,7 +56,7 @@ from pycrorm_async.events.types import Blob
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.orm.base import EPISODE, KEYS, Base, load_related
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.projections.columns import unite
+from pycrorm_async.projections.columns import physical_name, unite
 from pycrorm_async.projections.generations import Generation, all_views, current_generation, with_views
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.episode_diff import EpisodeDiff, diff_episodes
@@ -54,9 +68,10 @@ from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.snapshot import Moment, as_of
 from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.query.text import quiet, view
-from pycrorm_async.store.address import DatabaseAddress, no_tables
+from pycrorm_async.store.address import DatabaseAddress, check_replica, no_tables
 from pycrorm_async.store.lake import open_lake
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.replica import LAG_S_MAX, lag_between, open_to_read
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,6 +79,7 @@ if TYPE_CHECKING:
 
     from pycrorm_async.query.observed_images import ObservedPicture
 
+_logger = logging.getLogger("pycrorm_async")
 _ABSENT = re.compile(
     r'no such (?:table|column): (?:main\.)?"?(\w+)|relation "(\w+)" does not exist|column "?(\w+)"?\.\S+ does not exist'
 )
@@ -80,11 +96,22 @@ class Reading:
 
     Every result excludes simulations (`plan.SimulatedTaskTree`). With `simulated=True` a session or frame includes
     them, marked by `TaskTreeNode.simulated` and `ProcessMetaData.simulated`, and costs some ms more.
+
+    With a replica (`store.replica`) it asks that instead, but where simulations are wanted and the memory has some.
     """
 
-    def __init__(self, log: EventLog | DatabaseAddress) -> None:
-        """Read an open log, or one at an address, which is opened at the first query and closed by `close`."""
+    def __init__(
+        self, log: EventLog | DatabaseAddress, *, replica: DatabaseAddress | None = None, follows: bool = False
+    ) -> None:
+        """Read an open log, or one at an address, which is opened at the first query and closed by `close`.
+
+        With `follows` the replica is asked only while it shows all that was committed at the opening and at `follow`.
+        """
         self._address = log if isinstance(log, DatabaseAddress) else log.address
+        self._replica, self._follows = replica, follows
+        if replica is not None:
+            check_replica(replica, self._address)
+        self._sources: dict[DatabaseAddress, _Source] = {}
         self._opened: EventLog | None = None
         self._is_closed = False
         self._opening = asyncio.Lock()
@@ -96,21 +123,26 @@ class Reading:
 
     @classmethod
     @asynccontextmanager
-    async def open(cls, url: str) -> AsyncIterator[Self]:
-        """Open the existing memory at a URL.
+    async def open(cls, url: str, *, read_url: str | None = None) -> AsyncIterator[Self]:
+        """Open the existing memory at a URL; with `read_url`, that of a streaming replica, read from there.
 
-        Raises `UnknownUrl`; `DatabaseUnavailable` if no memory exists there, `DatabaseForeign` for a database of
-        another program or of a newer version.
+        A warning says when the replica is behind, or does not answer: then the memory at `url` is read.
+
+        Raises `UnknownUrl`; `CallerError` for a `read_url` of another memory; `DatabaseUnavailable` if no memory exists
+        there, `DatabaseForeign` for a database of another program or of a newer version.
         """
+        replica = DatabaseAddress.parse(read_url) if read_url else None
         with DatabaseAddress.parse(url).located() as address:
-            async with cls.open_address(address) as reading:
+            async with cls.open_address(address, replica) as reading:
                 yield reading
 
     @classmethod
     @asynccontextmanager
-    async def open_address(cls, address: DatabaseAddress) -> AsyncIterator[Self]:
+    async def open_address(
+        cls, address: DatabaseAddress, replica: DatabaseAddress | None = None
+    ) -> AsyncIterator[Self]:
         """Open the existing memory at a located address. Raises `DatabaseUnavailable` and `DatabaseForeign`."""
-        reading = cls(address)
+        reading = cls(address, replica=replica)
         try:
             await reading.refresh(maps=False)
             yield reading
@@ -126,10 +158,32 @@ class Reading:
         """Close the connections and unmap the classes, once; every query after it raises `CallerError`."""
         self._is_closed = True
         async with self._opening:
-            log, self._opened = self._opened, None
+            self._opened = None
             self._classes.dispose()
-            if log is not None:
-                await log.close()
+            for source in self._sources.values():
+                await source.log.close()
+
+    async def follow(self) -> None:
+        """Read from the replica once it shows what has been committed, which is awaited; until then from the memory."""
+        if self._replica is not None:
+            await self._ready()
+            async with self._opening:
+                await self._choose_source()
+
+    async def _choose_source(self) -> None:
+        replica, primary = self._sources.get(self._replica or self._address), await self._open_primary()
+        if replica is None or replica is primary:
+            return
+        try:
+            lag = await lag_between(replica.log, primary.log, LAG_S_MAX)
+            state, is_current = str(lag), lag.behind_bytes == 0
+        except DatabaseUnavailable as fault:
+            state, is_current = f"does not answer: {fault}", False
+        if self._opened is not (replica if is_current else primary).log:
+            _logger.warning(
+                "the replica %s %s; reading from %s", self._replica, state, "it again" if is_current else self._address
+            )
+        self._use((replica if is_current else primary).log)
 
     async def refresh(self, *, maps: bool = True) -> None:
         """Learn the designator types that were declared since the last call, and map them unless `maps` is false."""
@@ -163,13 +217,13 @@ class Reading:
     async def session(self, *, simulated: bool = False) -> AsyncIterator[AsyncSession]:
         """Open an ordinary SQLAlchemy session. Its objects stay readable after it is closed."""
         await self.refresh()
-        if not simulated:
+        if await self._shows_wanted(simulated=simulated):
             async with self._sessions() as session:
                 yield session
             return
         async with self._connection(simulated=True) as connection:
             connect = partial(with_views, views=self._all_views[1])
-            async with self._sessions(bind=connection, connect=connect) as session:
+            async with (await self._primary()).sessions(bind=connection, connect=connect) as session:
                 yield session
 
     @overload
@@ -434,25 +488,44 @@ class Reading:
         if self._opened is None:
             async with self._opening:
                 if self._opened is None:
-                    log = await EventLog.open(self._address, create=False)
+                    log = await open_to_read(self._address, self._replica)
                     try:
                         await _generation(log)
                     except BaseException:
                         await log.close()
                         raise
                     self._use(log)
+                    if self._follows and self._replica is not None:
+                        await self._choose_source()
 
     def _use(self, log: EventLog) -> None:
+        self._sessions = self._source(log).sessions
         self._opened = log
-        self._classes.use_in(log.engine)
-        on_access = LoadOnAccess(log.address.engine(read_only=True), log.translated)
-        self._classes.use_in(on_access.engine)
-        explain = partial(_explain_absent, log.address)
-        for engine in (log.engine, on_access.engine):
-            event.listen(engine.sync_engine, "handle_error", explain)
-        self._sessions = async_sessionmaker(
-            log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access
-        )
+
+    def _source(self, log: EventLog) -> _Source:
+        """Return the sessions of a log, with the classes and the errors of this memory."""
+        if log.address not in self._sources:
+            self._classes.use_in(log.engine)
+            on_access = LoadOnAccess(log.address.engine(read_only=True), log.translated)
+            self._classes.use_in(on_access.engine)
+            explain = partial(_explain_absent, self._address)
+            for engine in (log.engine, on_access.engine):
+                event.listen(engine.sync_engine, "handle_error", explain)
+            sessions = async_sessionmaker(
+                log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access
+            )
+            self._sources[log.address] = _Source(log, sessions)
+        return self._sources[log.address]
+
+    async def _primary(self) -> _Source:
+        """Return the source that is no replica."""
+        async with self._opening:
+            return await self._open_primary()
+
+    async def _open_primary(self) -> _Source:
+        if self._address not in self._sources:
+            self._source(await EventLog.open(self._address, create=False))
+        return self._sources[self._address]
 
     @property
     def _log(self) -> EventLog:
@@ -461,16 +534,32 @@ class Reading:
 
     @asynccontextmanager
     async def _connection(self, *, simulated: bool) -> AsyncIterator[AsyncConnection]:
-        if not simulated:
+        if await self._shows_wanted(simulated=simulated):
             async with self._log.engine.connect() as connection:
                 yield connection
             return
-        generation = await _generation(self._log)
+        log = (await self._primary()).log
+        generation = await _generation(log)
         if generation.revision != self._all_views[0]:
-            async with self._log.engine.connect() as connection:
+            async with log.engine.connect() as connection:
                 self._all_views = generation.revision, await all_views(connection, generation)
-        async with with_views(self._log.engine, self._all_views[1]) as connection:
+        async with with_views(log.engine, self._all_views[1]) as connection:
             yield connection
+
+    async def _shows_wanted(self, *, simulated: bool) -> bool:
+        """Return whether the public views show all that is wanted; others are temporary, which no replica makes."""
+        if not simulated or self._log.address != self._replica:
+            return not simulated
+        simulations = table(physical_name("simulated_episode", (await _generation(self._log)).number))
+        async with self._log.reading() as connection:
+            return not (await connection.execute(select(literal(1)).select_from(simulations).limit(1))).all()
+
+
+class _Source(NamedTuple):
+    """A log that is read, and its sessions."""
+
+    log: EventLog
+    sessions: async_sessionmaker[AsyncSession]
 
 
 def _explain_absent(memory: DatabaseAddress, context: ExceptionContext) -> None:

@@ -100,6 +100,11 @@ class DatabaseAddress:
         return self._path
 
     @property
+    def database(self) -> str | None:
+        """The name of the database on a server; the path of a SQLite file as in the URL."""
+        return self._url.database
+
+    @property
     def default_spool(self) -> Path:
         """The default spool: `x.db.spool` beside `x.db`; `database.spool` in the working directory for a server."""
         if self.is_sqlite:
@@ -252,3 +257,12 @@ def shared_address(url: str | DatabaseAddress) -> DatabaseAddress:
     if address.is_private:
         raise CallerError("sqlite:// exists only in its own process, no other can open it: name a file")
     return address
+
+
+def check_replica(replica: DatabaseAddress, primary: DatabaseAddress) -> None:
+    """Raise `CallerError` for an address that cannot be a replica of this one."""
+    if replica.is_sqlite or primary.is_sqlite or replica.database != primary.database:
+        raise CallerError(
+            f"{replica} is no replica of {primary}: a replica of a PostgreSQL server has the same databases; leave"
+            " --read-url (PYCRORM_READ_URL, read_url) out for this memory"
+        )

@@ -10,7 +10,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.cli.output import Form
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.cli.recall import _parse, recall
 from pycrorm_async.errors import CallerError
 from pycrorm_async.recall import blocks
@@ -169,7 +169,7 @@ WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
 def test_a_wrong_cue_is_refused_in_one_line(folder: Path, line: str) -> None:
     words, options = WRONG[line]
     with pytest.raises(CallerError) as refused:
-        recall(cue=words, **options, place=Place(f"sqlite:///{folder / 'pycrorm.db'}"), form=Form())
+        recall(cue=words, **options, place=ReadingPlace(f"sqlite:///{folder / 'pycrorm.db'}"), form=Form())
     assert line in str(refused.value)
     assert "\n" not in str(refused.value)
 

@@ -18,7 +18,7 @@ from pycrorm_async.cli import show as show_module
 from pycrorm_async.cli.episodes import episodes
 from pycrorm_async.cli.main import app
 from pycrorm_async.cli.output import Chosen, Form, stdout
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.cli.show import plain_lines, tree_of
 from pycrorm_async.events.codec import Record
 from pycrorm_async.query.named_queries import NodeSummary
@@ -83,7 +83,7 @@ def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
     ridden: Path, width: int, robots: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(stdout, "width", width)
-    episodes(place=Place(f"sqlite:///{ridden / 'pycrorm.db'}"), chosen=Chosen(), form=Form())
+    episodes(place=ReadingPlace(f"sqlite:///{ridden / 'pycrorm.db'}"), chosen=Chosen(), form=Form())
     printed = capsys.readouterr().out
     assert "Take the milk" in printed
     assert (("robots" in printed), ("pr2" in printed)) == (robots, robots)
@@ -92,7 +92,7 @@ def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
 def test_a_table_that_would_break_words_is_a_block_for_each_row(
     ridden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    place = Place(f"sqlite:///{ridden / 'pycrorm.db'}")
+    place = ReadingPlace(f"sqlite:///{ridden / 'pycrorm.db'}")
     monkeypatch.setattr(stdout, "width", 40)
     episodes(place=place, chosen=Chosen(), form=Form())
     lines = capsys.readouterr().out.splitlines()

@@ -53,6 +53,7 @@ NOT_RUN: Final = {
     "dask scheduler": "a service; `test_cluster.py` performs rollouts on a real cluster",
     "dask worker": "a service; `test_cluster.py` performs rollouts on a real cluster",
     "pycrorm writer --url postgresql://robot@lab": "needs the server `lab`",
+    "pycrorm verify --url postgresql://robot@lab": "needs a replica; `test_replica.py` asks one by each verb",
     "pycrorm learn --cluster": "needs the server `lab`; `test_cluster.py` performs rollouts on a real cluster",
     "ssh -L": "needs a second computer",
     "[Service]": "needs systemd; `test_pages.py` looks up the command that it starts",

@@ -22,7 +22,7 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.cli import report as command
 from pycrorm_async.cli.main import app
 from pycrorm_async.cli.output import Chosen
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
 from pycrorm_async.report import document
@@ -199,7 +199,7 @@ def test_a_full_page_names_the_next_window(
     monkeypatch.setattr("pycrorm_async.cli.output.note", notes.append)
     url = f"sqlite:///{recorded / 'pycrorm.db'}"
     page = tmp_path / "page.html"
-    command.report(episode="1", chosen=Chosen(), out=page, first=first, last=last, place=Place(url))
+    command.report(episode="1", chosen=Chosen(), out=page, first=first, last=last, place=ReadingPlace(url))
     assert any("the next page: --from " in each for each in notes) == continues
 
 

@@ -1,0 +1,120 @@
+"""Read a memory from a streaming replica of its PostgreSQL server, and report how far the replica is behind.
+
+    log = await open_to_read(primary, replica)
+
+**Theory of operation.** A replica replays the write-ahead log of its primary, in order, and so shows the memory as it
+was a moment ago: whole transactions, never a part of one. Two facts say how far it is behind. The position in the
+write-ahead log that the primary has written and the replica has replayed differ by a number of bytes, and the last
+commit that was replayed has a time. The time alone does not do, because nothing is committed while no robot records;
+nor do the bytes alone, because PostgreSQL writes some now and then that no reader can see. So a replica counts as
+behind when it has not replayed, after `SETTLE_S`, what the primary had written before.
+
+A reader that names a replica is refused one of another memory: a replica has the id of the log. While the replica
+does not answer, the primary does, and while the primary does not answer, the replica does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Final, NamedTuple
+
+from pycrorm_async.errors import CallerError, DatabaseUnavailable
+from pycrorm_async.store.address import DatabaseAddress, check_replica
+from pycrorm_async.store.log import EventLog
+
+LAG_S_MAX: Final = 5.0
+"""A replica that lacks changes, and whose last change is older than this, is reported."""
+SETTLE_S: Final = 0.2
+"""The time in which a replica that is not behind replays what its primary had written."""
+_POLL_S: Final = 0.02
+
+_WRITTEN = """
+SELECT (CASE WHEN pg_catalog.pg_is_in_recovery() THEN pg_catalog.pg_last_wal_replay_lsn()
+ELSE pg_catalog.pg_current_wal_flush_lsn() END - '0/0')::bigint"""
+_REPLAYED = """
+SELECT CASE WHEN pg_catalog.pg_is_in_recovery() THEN (pg_catalog.pg_last_wal_replay_lsn() - '0/0')::bigint END,
+pg_catalog.date_part('epoch', pg_catalog.clock_timestamp() - pg_catalog.pg_last_xact_replay_timestamp())"""
+"""Selects the position, null for a server that is no replica (any more), and the age of the last replayed commit."""
+
+_log = logging.getLogger("pycrorm_async")
+
+
+class ReplicaLag(NamedTuple):
+    """The changes that a replica lacks.
+
+    Attributes:
+        behind_bytes: of the primary's write-ahead log; 0 if it lacks none, None while the primary does not answer.
+        last_change_s: the age in seconds of the last change that it shows, by its own clock; None before the first.
+    """
+
+    behind_bytes: int | None
+    last_change_s: float | None
+
+    def __str__(self) -> str:
+        age = "" if self.last_change_s is None else f"; its last change is {self.last_change_s:,.0f} s old"
+        match self.behind_bytes:
+            case None:
+                return f"may be behind, because its primary does not answer{age}"
+            case 0:
+                return "shows all that its primary has committed"
+        return f"lacks {self.behind_bytes / 1024:,.1f} KiB of its primary's changes{age}"
+
+
+async def open_to_read(primary: DatabaseAddress, replica: DatabaseAddress | None) -> EventLog:
+    """Open the memory for reading, on its replica if one is given; warn where that is behind, or does not answer.
+
+    Raises `CallerError` for a server that is no replica of the primary, and the errors of `EventLog.open`.
+    """
+    if replica is None:
+        return await EventLog.open(primary, create=False)
+    check_replica(replica, primary)
+    try:
+        log = await EventLog.open(replica, create=False)
+    except DatabaseUnavailable as fault:
+        _log.warning("the replica does not answer: %s; reading from %s", fault, primary)
+        return await EventLog.open(primary, create=False)
+    try:
+        lag = await lag_of(log, primary)
+    except BaseException:
+        await log.close()
+        raise
+    if lag.behind_bytes is None or (lag.behind_bytes > 0 and (lag.last_change_s or 0.0) > LAG_S_MAX):
+        _log.warning("the replica %s %s", replica, lag)
+    return log
+
+
+async def lag_of(replica: EventLog, primary: DatabaseAddress) -> ReplicaLag:
+    """Return how far a replica is behind. Raises `CallerError` if it has another log than the primary."""
+    try:
+        log = await EventLog.open(primary, create=False)
+    except DatabaseUnavailable:
+        return ReplicaLag(None, (await _replayed(replica))[1])
+    try:
+        return await lag_between(replica, log, SETTLE_S)
+    finally:
+        await log.close()
+
+
+async def lag_between(replica: EventLog, primary: EventLog, patience_s: float) -> ReplicaLag:
+    """Wait until the replica has what the primary has now, at most for this long; return how far it is behind then.
+
+    Raises `CallerError` if these are two memories.
+    """
+    if replica.log_id != primary.log_id:
+        raise CallerError(f"{replica.address} holds another memory than {primary.address}: correct --read-url")
+    async with primary.reading() as connection:
+        written = (await connection.exec_driver_sql(_WRITTEN)).scalar_one()
+    end_s = asyncio.get_running_loop().time() + patience_s
+    while True:
+        position, last_change_s = await _replayed(replica)
+        lacks = 0 if position is None else max(0, written - position)
+        if not lacks or asyncio.get_running_loop().time() >= end_s:
+            return ReplicaLag(lacks, last_change_s)
+        await asyncio.sleep(_POLL_S)
+
+
+async def _replayed(replica: EventLog) -> tuple[int | None, float | None]:
+    async with replica.reading() as connection:
+        position, last_change_s = tuple((await connection.exec_driver_sql(_REPLAYED)).one())
+    return position, last_change_s
