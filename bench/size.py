@@ -69,6 +69,7 @@ def payloads(url: str, nodes: int) -> dict[str, float]:
 def learned(url: str, folder: Path, rollouts: int, empty: dict[str, int]) -> dict[str, Any]:
     """Learn from rollouts in Bullet and return the bytes a node of their memory."""
     numbers = {"rollouts": rollouts, "evaluate": rollouts // 5, "held-out": rollouts // 5}
+    numbers["min-samples-leaf"] = min(25, rollouts // 25)  # of 100 rollouts about ten succeed
     files = {"policy": folder / "policy.json", "figure": folder / "policies.png", "url": url}
     options = [part for name, value in (numbers | files).items() for part in (f"--{name}", str(value))]
     subprocess.run([sys.executable, "-m", "pycrorm_async", "learn", *options], check=True, stdout=subprocess.DEVNULL)
