@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Collection, Sequence
 from contextvars import Context
+from dataclasses import replace
 from datetime import datetime
 from typing import Any, TypeAlias
 
@@ -25,9 +26,11 @@ from pycrorm_async.orm import ObjectRemoval
 from pycrorm_async.query.again import RecordedWorld, world_of
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.scene import object_model
 from pycrorm_async.query.snapshot import Moment, parse_moment
+from pycrorm_async.visible_text import visible
 from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.pose import Vector
+from pycrorm_async.world.pose import ObjectType, Vector
 from pycrorm_async.world.queries import Camera, photograph
 
 MomentReference: TypeAlias = float | str | datetime | None
@@ -127,13 +130,35 @@ def _moving(number: int) -> Select[Any]:
 def _drawn(
     then: Moment, moved: Collection[str], size: tuple[int, int], yaw_deg: float | None, pitch_deg: float
 ) -> bytes:
-    with world_of(then) as world:
+    with world_of(_drawable(then)) as world:
         points = [name for name, shape in world.assumed.items() if shape.startswith("a point")]
         if len(points) == len(world.objects):
             reason = world.assumed[points[0]].removeprefix("a point, because ")
             raise CallerError(f"episode {then.number} has no shapes to draw: of {points[0]}, {reason}")
-        camera = _camera(world, moved, size, yaw_deg, pitch_deg)
+        camera = _camera(world, {visible(each, kept="") for each in moved}, size, yaw_deg, pitch_deg)
         return png(photograph(world, camera, *size).pixels)
+
+
+def _drawable(then: Moment) -> Moment:
+    """Return the moment as a world can hold it that is only drawn.
+
+    Another executive may have types of its own, names that occur twice or have control characters, and joints that are
+    not in its descriptions. Attachments move nothing in a picture.
+    """
+    objects, names = [], set[str]()
+    for each in then.world.objects:
+        kind = each.object_type if each.object_type in ObjectType.__members__ else "GENERIC_OBJECT"
+        name = visible(each.name, kept="")
+        name = f"{name}#{each.id}" if name in names else name
+        names.add(name)
+        joints = {visible(joint, kept=""): position for joint, position in each.joints.items()}
+        described = then.world.descriptions.get(each.description_fingerprint or "")
+        if described is not None and described.missing is None:
+            movable = {joint[0] for joint in object_model(described)["joints"] if joint[1] != "fixed" and not joint[-1]}
+            joints = {joint: position for joint, position in joints.items() if joint in movable}
+        base_link = visible(each.base_link, kept="") if each.base_link else None
+        objects.append(replace(each, name=name, object_type=kind, joints=joints, attached_to=None, base_link=base_link))
+    return replace(then, world=replace(then.world, objects=tuple(objects)))
 
 
 def _camera(

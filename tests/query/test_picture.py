@@ -25,6 +25,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from tests import mesh_files
+from tests.databases import put_memory
 
 # === picture ==================================================================================================
 #
@@ -88,6 +89,19 @@ async def test_a_picture_frames_what_moves_and_a_focus_one_object(url: str) -> N
         assert (await memory.as_of("last", sequence=99)).sequence == 4  # starts and ends of the episode and its root
     finally:
         await memory.close()
+
+
+@pytest.mark.slow
+def test_a_scene_of_another_executive_is_drawn_whatever_its_names_types_and_joints_are(tmp_path: Path) -> None:
+    hostile = "a\x01\x1b[31m\u202e<b>\n" + "n" * 300
+    with Memory.sync(put_memory(tmp_path / "memory.db")) as memory:
+        with memory.recording.episode(description="foreign") as episode:
+            episode.object_added("robot", hostile, "ROBOT", Pose([0, 3, 0]), {hostile: 0.5}, base_link=hostile)
+            episode.object_added("cube", hostile, "LEMONADE", Pose([0, 0, 0]), {"wheel": 0.5}, urdf=CUBE, color=RED)
+            episode.object_moved("cube", Pose([0, 1, 0]))
+            episode.object_attached("robot", "cube", hostile)
+        memory.flush()
+        assert redness(memory.picture("last", focus=hostile, width=160, height=120)) > 0.1
 
 
 PYRAMID = """<robot name="pyramid"><link name="base">
