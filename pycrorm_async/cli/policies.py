@@ -6,10 +6,10 @@ Panel: Ask, 4.
 from __future__ import annotations
 
 from pycrorm_async.cli.output import Form, moment, note, print_rows, print_table
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 
 
-def policies(*, place: Place, form: Form) -> None:
+def policies(*, place: ReadingPlace, form: Form) -> None:
     """List the policies that pick-ups were chosen by, the latest learned first: their origin, their use, their success.
 
     `succeeded` is the share of the pick-ups that a policy chose, with the interval of 95 %.
@@ -35,6 +35,6 @@ def policies(*, place: Place, form: Form) -> None:
         for each in summaries
     ]
     if form.is_table:
-        print_table(f"Policies of {place.address}", columns, rows)
+        print_table(f"Policies of {place.place.address}", columns, rows)
     else:
         print_rows(form, summaries, "", columns, rows)

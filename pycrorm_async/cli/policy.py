@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pycrorm_async.cli.output import JsonOption, counted, moment, note, print_facts, print_json, print_table
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 
 if TYPE_CHECKING:
     from pycrorm_async.learning.policy_cards import PolicyCard, Share
@@ -25,7 +25,7 @@ def policy(
     *,
     name: Annotated[str, typer.Argument(metavar="NAME", help="Its name, or the first digits of it.")],
     out: Annotated[Path | None, typer.Option(help="Write the policy to this file, for `load_policy`.")] = None,
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,
 ) -> None:
     """Show where a policy comes from, how it does, and write its file: the card of a model.
