@@ -34,7 +34,6 @@ from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.visible_text import visible
 from pycrorm_async.world.pose import MalformedPose, Pose
-from pycrorm_async.world.urdf import robot_description
 
 if TYPE_CHECKING:
     from pycrorm_async.query.observed_images import ObservedPicture
@@ -472,6 +471,8 @@ def _object(replay: EpisodeReplay, identity: int, value: WorldObject) -> ObjectT
 
 
 def _robot(robot: ObjectThen) -> RobotThen:
+    from pycrorm_async.world.urdf import robot_description  # which reading verbs need not load
+
     description = robot_description(robot.model or robot.name)
     torso = description.torso_joint if description is not None else None
     return RobotThen(robot.name, robot.pose, robot.joints.get(torso) if torso is not None else None)
