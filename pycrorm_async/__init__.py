@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pycrorm_async.events.types import Blob
     from pycrorm_async.memory import Memory
     from pycrorm_async.memory_parts import MemoryStatus
+    from pycrorm_async.operations.copy import read_archived
     from pycrorm_async.operations.recovery import recover
     from pycrorm_async.projections.custom import EpisodeProjection, Projection
     from pycrorm_async.projections.mapped_tables import UserView
@@ -45,6 +46,7 @@ __all__ = [
     "Settings",
     "UserView",
     "performable_of",
+    "read_archived",
     "recover",
     "with_tree",
     "world_of",
@@ -57,6 +59,7 @@ __getattr__ = lazy_names(
         "events.types": "Blob",
         "memory": "Memory",
         "memory_parts": "MemoryStatus",
+        "operations.copy": "read_archived",
         "operations.recovery": "recover",
         "projections.custom": "EpisodeProjection Projection",
         "projections.mapped_tables": "UserView",

@@ -9,14 +9,16 @@ the commit leaves files that the catalog does not know; an hour later the next a
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
+from itertools import groupby
+from operator import attrgetter
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import DamageError, DatabaseError
 from pycrorm_async.events.types import BlobReference, references_in
 from pycrorm_async.operations.copy import declared_by
-from pycrorm_async.operations.removal import EPISODES_AT_ONCE, remove
+from pycrorm_async.operations.removal import EVENTS_AT_ONCE, parts, remove
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.projections.rebuild import claimed
 from pycrorm_async.store.address import shared_address
@@ -64,7 +66,7 @@ async def archive_episodes(
                 rows = [each for each in await log.episodes() if _may_go(each, end_ns)]
                 rows = rows if only is None else [each for each in rows if each.number in only]
                 total, done = sum(each.head for each in rows), 0
-                for some in _parts(rows):
+                for some in parts(rows, _EVENTS_AT_ONCE):
                     await _archive(log, lake, some, reason, summary)
                     done += sum(each.head for each in some)
                     report_progress(done, total)
@@ -83,23 +85,11 @@ def _may_go(row: EpisodeRow, end_ns: float) -> bool:
     return ended and row.refused is None and row.parked is None and row.folded == row.head
 
 
-def _parts(rows: Sequence[EpisodeRow]) -> Iterator[list[EpisodeRow]]:
-    part: list[EpisodeRow] = []
-    events = 0
-    for row in rows:
-        if part and events + row.head > _EVENTS_AT_ONCE:
-            yield part
-            part, events = [], 0
-        part.append(row)
-        events += row.head
-    if part:
-        yield part
-
-
 async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason: str, summary: ArchiveSummary) -> None:
     there, erased = lake.episode_rows([each.id for each in rows]), lake.erased([each.id for each in rows])
     kept = await log.last_digests(rows[0].number, rows[-1].number)
     new: list[tuple[LakeEpisode, Sequence[StoredEvent]]] = []
+    read_events = await _events(log, rows)
     elsewhere = {each.id: each.archived_in for each in await log.restored(each.id for each in rows)}
     for row in rows:
         if elsewhere.get(row.id, lake.address) != lake.address:
@@ -110,7 +100,9 @@ async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason
             summary.stayed[row.id] = f"it was erased from the lake on {when}: `pycrorm erase` removes it here too"
             continue
         try:
-            events = await _events(log, row)
+            events = read_events.get(row.number, [])
+            if len(events) < row.head:  # raises for the one that is damaged or missing
+                events = [event async for page in log.pages(row) for event in page]
             digest = digest_after(RunningDigest.at_start(row.identity), events)
         except DamageError as damage:
             summary.stayed[row.id] = str(damage)
@@ -135,17 +127,17 @@ async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason
             summary.stayed[each.id] = "the lake holds other events of it than this memory"
     moved = [each for each in rows if each.id not in summary.stayed]
     digests = {row.number: read[row.id] for row in moved}
-    for first in range(0, len(moved), EPISODES_AT_ONCE):
-        some = moved[first : first + EPISODES_AT_ONCE]
+    for some in parts(moved, EVENTS_AT_ONCE):
         summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=digests))
 
 
-async def _events(log: EventLog, row: EpisodeRow) -> list[StoredEvent]:
-    """Read all events of an episode. Raises `LogDamaged` for a missing one."""
-    events = await log.spans([Span(row.number, 0, row.head)])
-    if len(events) < row.head:
-        return [event async for page in log.pages(row) for event in page]
-    return events
+async def _events(log: EventLog, rows: Sequence[EpisodeRow]) -> dict[int, list[StoredEvent]]:
+    """Read the events of episodes, by number; none if one of them is damaged."""
+    try:
+        events = await log.spans([Span(row.number, 0, row.head) for row in rows])
+    except DamageError:
+        return {}
+    return {number: [*some] for number, some in groupby(events, key=attrgetter("number"))}
 
 
 async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]]) -> None:

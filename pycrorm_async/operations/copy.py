@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from operator import attrgetter
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
@@ -37,6 +38,7 @@ from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
+    from pycrorm_async.query.reading import Reading
 
 
 Source: TypeAlias = EventLog | Lake
@@ -104,6 +106,30 @@ async def copy_episodes(
     finally:
         await log.close()
     return CopySummary(str(log.address), target_address.to_type, done)
+
+
+@asynccontextmanager
+async def read_archived(lake: str, episodes: Sequence[str] = ()) -> AsyncIterator[Reading]:
+    """Read archived episodes as those of a memory, without bringing one back: frames, questions, recall, pages.
+
+    >>> async with read_archived("ducklake:/nfs/lake", ["01975a3c"]) as reading:
+    ...     frame = await reading.dataframe(PickUpWithContextView)
+
+    Folds them, given by id or first digits of it, by default all, into a temporary memory that the end of the context
+    deletes; it takes what `pycrorm restore` takes in time, and on the disk of temporary files. The numbers of the
+    episodes and their row ids are those of that memory. Raises `UnknownEpisode`, `MissingExtra`, `DatabaseUnavailable`,
+    and `DamageError` for an episode that cannot be read or folded whole.
+    """
+    from pycrorm_async.query.reading import Reading  # here, because it loads the mapped classes
+
+    with TemporaryDirectory(prefix="pycrorm-lake-") as folder:
+        url = f"sqlite:///{folder}/memory.db"
+        summary = await copy_episodes(lake, url, episodes=episodes)
+        for each in summary.episodes:
+            if fault := each.damage or each.stopped:
+                raise DamageError(f"{summary.source}: episode {each.id}: {fault}")
+        async with Reading.open(url) as reading:
+            yield reading
 
 
 @asynccontextmanager

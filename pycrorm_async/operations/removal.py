@@ -16,7 +16,7 @@ then removes the events alone, and the same command, run by a login of that role
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, TablesForeign
-from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.events.ids import parse_episode_id, row_id_min
 from pycrorm_async.events.types import references_in
 from pycrorm_async.projections.columns import EPISODE, OWN
 from pycrorm_async.projections.generations import read_generation, read_generations, write_generation
@@ -39,9 +39,11 @@ from pycrorm_async.store.lake import erase_in_lake
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
 
-EPISODES_AT_ONCE: Final = 100
-"""Bounds the episodes of one transaction, and with them the time for which others wait for the write lock."""
-_BLOB_EVENTS = text("SELECT type, payload FROM event WHERE episode = :number AND payload LIKE '%\"$blob\"%'")
+EVENTS_AT_ONCE: Final = 10_000
+"""Bounds the events of one transaction, unless an episode has more, and so the time that others wait to write."""
+_ROW_KEYS: Final = ("id", "resolution_id", "node_id")
+"""The names of the column with the row id that begins the key of a table, the first that a table has."""
+_BLOB_EVENTS = "SELECT type, payload FROM event WHERE payload LIKE '%\"$blob\"%' AND episode IN "
 _REFERRED = text("SELECT 1 FROM event WHERE payload LIKE :pattern LIMIT 1")
 _REFERRED_BY_TYPE = text("SELECT 1 FROM pycrorm_declaration WHERE payload LIKE :pattern LIMIT 1")
 _DELETE_BLOB = text("DELETE FROM pycrorm_blob WHERE hash = :hash")
@@ -108,8 +110,8 @@ async def erase(
             ]
             await dialect_of(connection).execute(connection, schema.UPSERT_REMOVED, removed=changed)
     there = [each for each in rows if isinstance(each, EpisodeRow)]
-    for first in range(0, len(there), EPISODES_AT_ONCE):
-        await remove(log, there[first : first + EPISODES_AT_ONCE], reason=reason)
+    for some in parts(there, EVENTS_AT_ONCE):
+        await remove(log, some, reason=reason)
     numbers = [each.number for each in rows]
     tables = await _remove_rows(log, numbers, left)
     if fault := await dialect_of(log.engine).purge(log.engine, tables):
@@ -129,6 +131,20 @@ async def erase(
                 connection, statement, now_ns=SYSTEM_CLOCK.wall_ns(), numbers=[(each.number,) for each in finished]
             )
     return done
+
+
+def parts(rows: Sequence[EpisodeRow], events_max: int) -> Iterator[list[EpisodeRow]]:
+    """Yield the episodes in parts of at most so many events; one that has more is a part of its own."""
+    part: list[EpisodeRow] = []
+    events = 0
+    for row in rows:
+        if part and events + row.head > events_max:
+            yield part
+            part, events = [], 0
+        part.append(row)
+        events += row.head
+    if part:
+        yield part
 
 
 async def remove(
@@ -182,9 +198,8 @@ async def remove(
 async def _delete_events(connection: AsyncConnection, numbers: Sequence[int]) -> None:
     dialect = dialect_of(connection)
     hashes: set[str] = set()
-    for number in numbers:
-        for kind, payload in await connection.execute(_BLOB_EVENTS, {"number": number}):
-            hashes |= {each.hash for each in references_in(kind, payload.encode())}
+    for kind, payload in await connection.execute(text(f"{_BLOB_EVENTS}{_list(numbers)}")):
+        hashes |= {each.hash for each in references_in(kind, payload.encode())}
     digests = [schema.DIGEST] if (await dialect.table_state(connection, schema.DIGEST)).exists else []
     if not (await dialect.table_state(connection, schema.BLOB)).exists:
         hashes.clear()
@@ -229,11 +244,15 @@ async def _lock_tables(connection: AsyncConnection) -> dict[str, set[str]]:
 
 
 async def _delete_rows(connection: AsyncConnection, tables: Mapping[str, set[str]], numbers: Sequence[int]) -> None:
+    lowest, end = row_id_min(min(numbers)), row_id_min(max(numbers) + 1)
     for name, columns in tables.items():
         is_keyed = columns <= {"id", "folded", "parked"} or "process_metadata__" in name
         if is_keyed or EPISODE in columns:
             key = "id" if is_keyed else EPISODE
-            await connection.exec_driver_sql(f'DELETE FROM "{name}" WHERE {key} IN {_list(numbers)}')  # noqa: S608
+            row = None if is_keyed else next((each for each in _ROW_KEYS if each in columns), None)
+            # Not every table has an index on the episode; each has one on the row ids, which the fold makes of it.
+            within = f" AND {row} >= {lowest} AND {row} < {end}" if row else ""
+            await connection.exec_driver_sql(f'DELETE FROM "{name}" WHERE {key} IN {_list(numbers)}{within}')  # noqa: S608
         if f"{OWN}{BLOCKS}__" in name:
             await remove_cases(connection, int(name.rpartition("__")[2]), numbers)
 

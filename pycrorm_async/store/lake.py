@@ -24,6 +24,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from pycrorm_async.bulk_records import make
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import (
     CallerError,
@@ -57,8 +58,8 @@ _LATER: Final = {"erased"}
 _ORPHAN_AGE_S: Final = 3600.0
 """Age from which a file that the catalog does not know is not one of an archive that runs: it commits after seconds."""
 _PAGE_EVENTS: Final = 5_000
-_EPISODES_AT_ONCE: Final = 200
-"""The episodes that one query reads."""
+_EVENTS_AT_ONCE: Final = 50_000
+"""Bounds the events that one query reads, unless an episode has more; each query reads whole groups of rows."""
 
 
 class LakeEpisode(NamedTuple):
@@ -210,7 +211,8 @@ class Lake:
         self._given = address
         self.blobs = self
         self._connection = open_lake(address, write=write)
-        self._listed: list[str] = []
+        self._listed: list[LakeEpisode] = []
+        self._places: dict[str, int] = {}
         self._events: dict[str, list[StoredEvent]] = {}
 
     async def close(self) -> None:
@@ -233,7 +235,9 @@ class Lake:
         columns = "id::VARCHAR, max(head), min(started_wall_ns), max(ended_wall_ns), arg_max(digest, head)"
         query = f"SELECT {columns} FROM episode {chosen} GROUP BY id ORDER BY id"
         rows = {row[0]: LakeEpisode(*row) for row in self.execute(query, [] if ids is None else [list(ids)])}
-        self._listed = list(dict.fromkeys((*self._listed, *rows)))
+        new = [each for each in rows.values() if each.id not in self._places]
+        self._places |= {each.id: place for place, each in enumerate(new, len(self._listed))}
+        self._listed += new
         return rows
 
     async def placement(self) -> Placement:
@@ -260,20 +264,27 @@ class Lake:
         Reads it together with those that were listed behind it, because a query costs more than an episode.
         """
         if episode.id not in self._events:
-            place = self._listed.index(episode.id)
-            self._events = self._events_of(self._listed[place : place + _EPISODES_AT_ONCE])
+            first = place = self._places[episode.id]
+            left = _EVENTS_AT_ONCE - self._listed[first].head
+            while (place := place + 1) < len(self._listed) and self._listed[place].head <= left:
+                left -= self._listed[place].head
+            self._events = self._events_of([each.id for each in self._listed[first:place]])
         events = self._events.pop(episode.id, [])[after:]
         for first in range(0, len(events), _PAGE_EVENTS):
             yield events[first : first + _PAGE_EVENTS]
 
     def _events_of(self, ids: Sequence[str]) -> dict[str, list[StoredEvent]]:
         query = (
-            "SELECT DISTINCT episode::VARCHAR, sequence, type, version, wall_ns, monotonic_ns, encode(payload)"
-            " FROM event WHERE episode IN (SELECT unnest(?)::UUID) ORDER BY episode, sequence"
+            "SELECT episode::VARCHAR, sequence, type, version, wall_ns, monotonic_ns, encode(payload)"
+            " FROM event WHERE episode IN (SELECT unnest(?)::UUID) AND episode BETWEEN ?::UUID AND ?::UUID"
+            " ORDER BY episode, sequence"
         )
         events: dict[str, list[StoredEvent]] = {}
-        for row in self.execute(query, [list(ids)]):
-            events.setdefault(row[0], []).append(StoredEvent(0, *row[1:]))
+        before = None
+        for row in self.execute(query, [[*ids], min(ids), max(ids)]) if ids else ():
+            if row != before:
+                events.setdefault(row[0], []).append(make(StoredEvent, (0, *row[1:])))
+            before = row
         return events
 
     async def declarations(self) -> list[bytes]:

@@ -14,11 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async import Reading
+from pycrorm_async import Memory, Reading, read_archived
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.removal import erasable, erase
+from pycrorm_async.orm import PickUpWithContextView
+from pycrorm_async.recall.recall import Recall
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.lake import Lake, erase_in_lake, query_lake
 from pycrorm_async.store.log import EventLog
@@ -27,7 +29,9 @@ from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import ask, put_memory
 from tests.operations.memories import everything, notes
 from tests.operations.test_removal import SECRET, assert_clean, erased, places_with, recorded
+from tests.plan.conftest import kitchen
 from tests.table_comparison import differences, logs_of, tables_of
+from tests.upstream.conftest import common_plan
 
 pytest.importorskip("duckdb_extension_ducklake", reason="the extra [lake] is not installed")
 pytestmark = pytest.mark.slow
@@ -184,6 +188,38 @@ async def test_an_erasure_that_is_killed_at_any_step_is_finished_by_the_next(tmp
         files = [str(each) for each in (tmp_path / "lake/data/main/event").iterdir()]
         query = f"SELECT count(*) FROM read_parquet({files}, union_by_name => true) WHERE episode = '{ids[1]}'"
         assert query_lake(lake, query)[1] == [(0,)], last
+
+
+async def test_archived_episodes_are_read_as_those_of_a_memory_without_a_restore(
+    tmp_path: Path, lake: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    await notes(url, "a")
+    async with Memory.open(url) as memory, memory.episode(description="in the kitchen"):
+        with kitchen():
+            await common_plan()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    ids = [*logs_of(url)]
+    async with Reading.open(url) as reading:
+        frame = await reading.dataframe(PickUpWithContextView)
+        durations = await reading.ask.durations(episode=ids[1]).rows()
+    await archived(url, lake)
+    async with read_archived(lake, [ids[1][:30]]) as reading:
+        assert [each.id for each in await reading.episodes()] == [ids[1]]
+        own = await reading.dataframe(PickUpWithContextView)
+        assert [row[:2] for row in await reading.ask.durations().rows()] == [row[:2] for row in durations]
+        assert len((await Recall.of(reading)("PickUpAction")).cases) > 0
+    of_rows = [name for name in frame.columns if not name.endswith("id")]
+    assert len(frame) > 0
+    assert own[of_rows].equals(frame[of_rows])
+    async with read_archived(lake) as reading:
+        assert {each.id for each in await reading.episodes()} == {*ids}
+    assert [*(tmp_path / "temporary").iterdir()] == []
+    assert logs_of(url) == {}
+    with pytest.raises(UnknownEpisode):
+        async with read_archived(lake, ["ffffffff"]):
+            pass
 
 
 def archive_until_commit(url: str, lake: str) -> None:
