@@ -27,21 +27,27 @@ from pycrorm_async.learning.experiment import (
     Experiment,
     ExperimentResult,
     KitchenResult,
+    Learned,
     Phase,
     Study,
+    drawn_of,
     pick_up_in_kitchen,
     study,
 )
-from pycrorm_async.learning.policy import default_policy, draw_policies
+from pycrorm_async.learning.features import PickUpContext
+from pycrorm_async.learning.policy import Policy, default_policy, draw_policies
 from pycrorm_async.learning.policy_file import name_of, save_policy
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scenes import Scene
+from pycrorm_async.learning.success_model import Draws, SuccessModel
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.engines import engine_class
 from pycrorm_async.world.urdf import Limits
 
+LEAVES = {Learned.PLACES: 25, Learned.POLAR: 20, Learned.SUCCESS: 10}
+"""The rows in a leaf, unless others are chosen."""
 _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
@@ -51,6 +57,27 @@ def learn(
     rounds: Annotated[
         int, typer.Option(min=1, help="Rounds: the first acts at random, each further one by the latest policy.")
     ] = 1,
+    model: Annotated[
+        Learned,
+        typer.Option(
+            help="What is learned: a tree of places, as in the thesis; a tree of polar features, which sets the torso;"
+            " or a model of success, which learns from failures too.",
+        ),
+    ] = Learned.PLACES,
+    explore: Annotated[
+        Draws | None,
+        typer.Option(
+            help="How the further rounds of --model success try: where the model is uncertain (the default), where it"
+            " is confident, or at random.",
+        ),
+    ] = None,
+    heights: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="Limits of the object's height in m, drawn for each rollout, as is its heading; else it is at 0.9 m.",
+        ),
+    ] = None,
     evaluate: Annotated[int, typer.Option(min=1, help="Rollouts that evaluate the learned policy.")] = 2_000,
     held_out: Annotated[
         int, typer.Option(min=1, help="Random rollouts kept out of learning, to measure the policy's coverage.")
@@ -65,8 +92,13 @@ def learn(
         ),
     ] = None,
     min_samples_leaf: Annotated[
-        int, typer.Option(min=2, help="Successes in a leaf of the tree; small leaves repeat the successes exactly.")
-    ] = 25,
+        int | None,
+        typer.Option(
+            min=2,
+            help="Successes in a leaf of the tree; small leaves repeat the successes exactly. 25 for places, 20 for"
+            " polar features; of a model of success 10 tries.",
+        ),
+    ] = None,
     limits: Annotated[
         Limits, typer.Option(help="Ranges of the arms' joints to use.", case_sensitive=False)
     ] = Limits.SOFT,
@@ -105,20 +137,27 @@ def learn(
     # that of the packages comes last, because importing them takes half a second.
     DatabaseAddress.parse(place.url)
     _check_files(policy, figure)
+    if explore is not None and model is not Learned.SUCCESS:
+        raise CallerError(f"--explore {explore} needs --model success: other policies try as they act")
+    if study_rollouts and model is not Learned.PLACES:
+        raise CallerError(f"--study needs --model places, got --model {model}")
+    scene = Scene(limits=limits, collisions=collisions, heights=heights, turned=heights is not None)
     experiment = Experiment(
+        model=model,
+        explore=explore or Draws.UNCERTAIN,
         rollouts=rollouts,
         rounds=rounds,
         evaluate=evaluate,
         held_out=held_out,
         seed=seed,
-        min_samples_leaf=min_samples_leaf,
-        scene=Scene(limits=limits, collisions=collisions),
+        min_samples_leaf=LEAVES[model] if min_samples_leaf is None else min_samples_leaf,
+        scene=scene,
         workers=workers,
         cluster=cluster,
         episode_each=episode_each,
         resume=resume,
     )
-    _check_packages(cluster)
+    _check_packages(model, cluster)
     location = MemoryLocation(*place)
     with progress_bar("rollouts", unit="rollouts") as bar:
 
@@ -128,9 +167,12 @@ def learn(
 
         learned, in_kitchen, studied = asyncio.run(_run(experiment, location, study_rollouts, report_progress))
     save_policy(learned.policy, policy)
+    drawn = (
+        learned.policy if isinstance(learned.policy, Policy) else drawn_of(learned.policy, _middle(scene), seed=seed)
+    )
     titles = {
         f"default policy: {_percent(learned.default.tally)} succeed": default_policy(),
-        f"learned policy: {_percent(learned.evaluation.tally)} succeed": learned.policy,
+        f"learned policy: {_percent(learned.evaluation.tally)} succeed": drawn,
     }
     draw_policies(titles, figure, successes=learned.successes)
     if as_json:
@@ -141,9 +183,18 @@ def learn(
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
 
 
-def _check_packages(cluster: str | None) -> None:
+def _middle(scene: Scene) -> PickUpContext:
+    """Return the context in which the figure shows a policy that sets the torso: half way up, with all of it."""
+    low, high = scene.heights or (scene.position[2], scene.position[2])
+    return PickUpContext((low + high) / 2, torso_limits=(0.0, 0.33))
+
+
+def _check_packages(model: Learned, cluster: str | None) -> None:
+    learner = ("jpt", "pyjpt (for Python up to 3.12)", "learning")
+    if model is Learned.SUCCESS:
+        learner = ("sklearn", "scikit-learn", "learning")
     for module, package, extra in (
-        ("jpt", "pyjpt (for Python up to 3.12)", "learning"),
+        learner,
         ("matplotlib", "matplotlib", "learning"),
         ("pandas", "pandas", "learning"),
         *([("distributed", "distributed", "cluster")] if cluster is not None else []),
@@ -209,7 +260,7 @@ def _print(learned: ExperimentResult, in_kitchen: KitchenResult, studied: Study 
     print_facts(
         "Learned",
         {
-            "from": f"{len(learned.successes):,} successes, {len(learned.policy.leaves)} leaves",
+            "from": _size(learned),
             "coverage": _coverage(learned),
             "kitchen": _kitchen(in_kitchen),
         },
@@ -251,6 +302,13 @@ def _kitchen(trial: KitchenResult) -> str:
     x, y, _ = trial.done.standing_position.position
     how = f"with the {trial.done.arm.name} arm from {trial.done.grasp.name}, robot base at {x:.2f}, {y:.2f} m"
     return f"picked up at attempt {trial.tries}, {how}"
+
+
+def _size(learned: ExperimentResult) -> str:
+    policy, successes = learned.policy, len(learned.successes)
+    if isinstance(policy, SuccessModel):
+        return f"{successes:,} successes and {policy.rollouts - successes:,} failures, {len(policy.trees)} trees"
+    return f"{successes:,} successes, {len(policy.leaves)} leaves"
 
 
 def _coverage(learned: ExperimentResult) -> str:
@@ -311,7 +369,13 @@ def _document(
             }
             for each in learned.phases
         ],
-        "policy": {"name": name_of(learned.policy), "leaves": len(learned.policy.leaves), "file": str(policy)},
+        "model": experiment.model,
+        "policy": {
+            "name": name_of(learned.policy),
+            "leaves": None if isinstance(learned.policy, SuccessModel) else len(learned.policy.leaves),
+            "trees": len(learned.policy.trees) if isinstance(learned.policy, SuccessModel) else None,
+            "file": str(policy),
+        },
         "figure": str(figure),
         "successes": len(learned.successes),
         "coverage": learned.coverage,

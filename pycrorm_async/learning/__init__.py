@@ -28,7 +28,7 @@ from pycrorm_async.learning.rollouts import Tally, batch_rollout, rollouts_quest
 from pycrorm_async.learning.scenes import Disturbance, Scene, Stage
 from pycrorm_async.learning.success_model import Draws, SuccessModel
 from pycrorm_async.learning.transport import TransportPolicy
-from pycrorm_async.learning.tree import learn
+from pycrorm_async.learning.tree import learn, learn_polar
 
 __all__ = [
     "MoveAndPickUp",
@@ -37,6 +37,7 @@ __all__ = [
     "PredictedPickUpPerformable",
     "default_policy",
     "learn",
+    "learn_polar",
     "Policy",
     "PolarPolicy",
     "SuccessModel",

@@ -1,5 +1,8 @@
 """Run the learning experiment of the thesis (5.2): perform random pick-ups, learn from the successes, try again.
 
+A policy of another kind is learned in the same way (`Learned`): its first round tries ways of the default policy with
+any height of the torso. A success model learns from the failures too, and can try where it is unsure.
+
 Every result is queried from the memory and compared with the workers' own counts. An interrupted experiment can be
 resumed: only the rollouts that are not recorded yet are performed.
 """
@@ -11,6 +14,8 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,14 +24,17 @@ from sqlalchemy import select
 from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
 from pycrorm_async.learning.cluster import RolloutPool, rollout_pool
+from pycrorm_async.learning.features import PickUpContext
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.polar_policy import PolarPolicy
 from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy
-from pycrorm_async.learning.policy_file import name_of
+from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask
 from pycrorm_async.learning.recorded_policy import Evaluation, read_evaluation, record_evaluation, record_policy
 from pycrorm_async.learning.rollouts import Tally, tally_of
 from pycrorm_async.learning.scenes import Scene
-from pycrorm_async.learning.tree import check_leaf, learn
+from pycrorm_async.learning.success_model import CONFIDENT, Draws, SuccessModel
+from pycrorm_async.learning.tree import check_leaf, learn, learn_polar
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import LearnPolicyAction
@@ -39,6 +47,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+_DRAWN = 20_000
+"""The ways from which the figure of a policy that sets the torso is drawn."""
 HELD_OUT_SEED = 1_000_003
 """Added to the experiment's seed for the held-out default rollouts, so that their seed is not used for learning."""
 
@@ -46,11 +56,27 @@ ReportProgress = Callable[[str, int, int, Tally], None]
 """Callback for progress: the phase's name, rollouts done, rollouts in total, results so far."""
 
 
+class Learned(StrEnum):
+    """The kinds of policies that an experiment learns.
+
+    Attributes:
+        PLACES: a tree of places, the thesis' policy (`learn`).
+        POLAR: a tree of polar features, which sets the torso (`learn_polar`).
+        SUCCESS: a success model (`SuccessModel`).
+    """
+
+    PLACES = "places"
+    POLAR = "polar"
+    SUCCESS = "success"
+
+
 @dataclass(frozen=True)
 class Experiment:
     """The parameters of an experiment.
 
     Attributes:
+        model: what is learned.
+        explore: how a success model picks the ways that are tried in all rounds but the first.
         rollouts: rollouts per round: the first round uses the default policy, each later one the policy learned so
             far.
         rounds: number of rounds; after each, a policy is learned from the successes of all rounds.
@@ -69,6 +95,8 @@ class Experiment:
     evaluate: int = 10_000
     held_out: int = 5_000
     seed: int = 69
+    model: Learned = Learned.PLACES
+    explore: Draws = Draws.UNCERTAIN
     min_samples_leaf: int = 25
     scene: Scene = field(default_factory=Scene)
     workers: int = 1
@@ -127,12 +155,13 @@ class ExperimentResult:
     Attributes:
         phases: in this order: default rollouts, further rounds, evaluation, held-out rollouts.
         policy: the policy of the last round.
-        successes: the choices from which it was learned.
-        coverage: the share of the held-out successes that the policy could have chosen; None if none succeeded.
+        successes: the choices that succeeded among those from which it was learned.
+        coverage: the share of the held-out successes that the policy could have chosen; None if none succeeded. Of a
+            success model, that of which it is confident.
     """
 
     phases: tuple[Phase, ...]
-    policy: Policy
+    policy: AnyPolicy
     successes: tuple[PickUpChoice, ...]
     coverage: float | None
 
@@ -167,10 +196,10 @@ class _PhaseRunner:
         self._place = place
         self.phases: list[Phase] = []
 
-    async def phase(self, name: str, policy: Policy, seed: int, count: int) -> pd.DataFrame:
+    async def phase(self, name: str, policy: AnyPolicy, seed: int, count: int) -> pd.DataFrame:
         """Return the rollouts with index 0 to `count` - 1 under this policy; perform those not recorded yet first."""
         experiment = self._experiment
-        recorded = await read_rollouts(self._reading, experiment.scene, name_of(policy), seed, count)
+        recorded = await self._read(policy, seed, count)
         if len(recorded) and not experiment.resume:
             raise CallerError(
                 f"{len(recorded):,} rollouts of this experiment are recorded already (seed {experiment.seed},"
@@ -190,7 +219,7 @@ class _PhaseRunner:
             )
         seconds = time.monotonic() - began
         if counted.rollouts:
-            frame = await read_rollouts(self._reading, experiment.scene, name_of(policy), seed, count)
+            frame = await self._read(policy, seed, count)
         tally = tally_of(frame)
         if tally != recorded_tally + counted or tally.rollouts != count:
             raise InternalError(f"{name}: the workers counted {recorded_tally + counted}, the memory holds {tally}")
@@ -212,7 +241,11 @@ class _PhaseRunner:
         )
         return frame
 
-    async def record(self, policy: Policy, *, rounds: int, successes: int) -> None:
+    async def _read(self, policy: AnyPolicy, seed: int, count: int) -> pd.DataFrame:
+        scene, predicted = self._experiment.scene, not isinstance(policy, Policy)
+        return await read_rollouts(self._reading, scene, name_of(policy), seed, count, predicted=predicted)
+
+    async def record(self, policy: AnyPolicy, *, rounds: int, successes: int) -> None:
         """Record the policy learned after that many rounds, with its training episodes, unless it is recorded."""
         experiment, name = self._experiment, name_of(policy)
         seeds = [experiment.seed + number for number in range(rounds)]
@@ -234,7 +267,7 @@ class _PhaseRunner:
                 seeds=seeds,
             )
 
-    async def record_evaluation(self, policy: Policy, evaluation: Evaluation) -> None:
+    async def record_evaluation(self, policy: AnyPolicy, evaluation: Evaluation) -> None:
         """Record the evaluation of a policy, unless one is recorded."""
         name = name_of(policy)
         if await read_evaluation(self._reading, name) is None:
@@ -271,34 +304,77 @@ async def run(
         Reading.open(place.url) as reading,
     ):
         runner = _PhaseRunner(experiment, place, workers, reading, report_progress)
-        policy, frames = default_policy(), []
+        first = default_policy() if experiment.model is Learned.PLACES else SuccessModel.untrained()
+        policy: AnyPolicy = first
+        frames: list[pd.DataFrame] = []
         for number in range(experiment.rounds):
             name = "default policy" if number == 0 else f"learned policy, round {number + 1}"
-            frame = await runner.phase(name, policy, experiment.seed + number, experiment.rollouts)
-            frames.append(recorded_rollouts.successes(frame))
-            policy = learn(pd.concat(frames), min_samples_leaf=experiment.min_samples_leaf)
-            await runner.record(policy, rounds=number + 1, successes=sum(map(len, frames)))
+            explorer = _explorer(experiment, policy, first)
+            frames.append(await runner.phase(name, explorer, experiment.seed + number, experiment.rollouts))
+            tries = pd.concat(frames)
+            policy = _learned(experiment, tries)
+            await runner.record(policy, rounds=number + 1, successes=len(recorded_rollouts.successes(tries)))
         await runner.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
-        held_out = await runner.phase("default policy, held out", default_policy(), held_out_seed, experiment.held_out)
+        held_out = await runner.phase("default policy, held out", first, held_out_seed, experiment.held_out)
         coverage = coverage_of(held_out, policy)
         await runner.record_evaluation(policy, Evaluation(coverage=coverage))
-        choices = tuple(choice for frame in frames for choice in choices_of(frame))
-        return ExperimentResult(tuple(runner.phases), policy, choices, coverage)
+        successes = tuple(choices_of(recorded_rollouts.successes(tries)))
+        return ExperimentResult(tuple(runner.phases), policy, successes, coverage)
 
 
-async def read_rollouts(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:
-    """Return the recorded rollouts with an index below `count`, each index once."""
-    question = recorded_rollouts.rollouts_question(scene=str(scene), seed=seed, policy=policy)
+def _explorer(experiment: Experiment, policy: AnyPolicy, first: AnyPolicy) -> AnyPolicy:
+    """Return the policy by which the next round acts."""
+    if not isinstance(policy, SuccessModel) or policy is first:
+        return policy
+    return first if experiment.explore is Draws.RANDOM else policy.drawing(experiment.explore)
+
+
+def _learned(experiment: Experiment, tries: pd.DataFrame) -> AnyPolicy:
+    """Return the policy learned from these rollouts. Raises `NotEnoughExperience`."""
+    leaf = experiment.min_samples_leaf
+    match experiment.model:
+        case Learned.SUCCESS:
+            return SuccessModel.fit(tries, min_samples_leaf=leaf)
+        case Learned.POLAR:
+            return learn_polar(recorded_rollouts.successes(tries), min_samples_leaf=leaf)
+        case Learned.PLACES:
+            return learn(recorded_rollouts.successes(tries), min_samples_leaf=leaf)
+
+
+def drawn_of(policy: PolarPolicy | SuccessModel, context: PickUpContext, *, seed: int) -> list[PickUpChoice]:
+    """Return many ways of the policy in this context: of a success model those of which it is confident, in the air."""
+    rng = np.random.default_rng(seed)
+    if isinstance(policy, PolarPolicy):
+        return policy.sample(rng, _DRAWN, context)
+    low, high = context.torso_limits or (context.torso, context.torso)
+    torsos = rng.uniform(low, high, _DRAWN).tolist()
+    ways = [
+        each._replace(torso=torso) for each, torso in zip(default_policy().sample(rng, _DRAWN), torsos, strict=True)
+    ]
+    return list(compress(ways, policy.probability(ways, context) >= CONFIDENT))
+
+
+async def read_rollouts(
+    reading: Reading, scene: Scene, policy: str, seed: int, count: int, *, predicted: bool = False
+) -> pd.DataFrame:
+    """Return the recorded rollouts with an index below `count`, each index once.
+
+    With `predicted` they are those of a policy that sets the torso, with the columns that a success model learns from.
+    """
+    question = recorded_rollouts.rollouts_question(scene=str(scene), seed=seed, policy=policy, predicted=predicted)
     # Rollouts with the same seed and index are identical, so any of them will do.
     frame = (await reading.dataframe(question)).drop_duplicates("index")
-    return frame[frame["index"] < count]
+    frame = frame[frame["index"] < count]
+    return recorded_rollouts.with_parameters(frame) if predicted else frame
 
 
-def coverage_of(held_out: pd.DataFrame, policy: Policy) -> float | None:
+def coverage_of(held_out: pd.DataFrame, policy: AnyPolicy) -> float | None:
     """Return the share of these rollouts' successes that the policy could have chosen; None if none succeeded."""
-    choices = choices_of(recorded_rollouts.successes(held_out))
-    return policy.coverage(choices) if choices else None
+    done = recorded_rollouts.successes(held_out)
+    if not len(done):
+        return None
+    return policy.coverage(choices_of(done)) if isinstance(policy, Policy) else policy.coverage(done)
 
 
 def choices_of(frame: pd.DataFrame) -> list[PickUpChoice]:
@@ -400,8 +476,12 @@ async def study(
 ) -> Study:
     """Evaluate the learned policy, `rollouts` rollouts per point and scene.
 
-    Raises `WorkerLost`, and `InternalError` if the same rollouts ended differently without recording.
+    Raises `WorkerLost`, `InternalError` if the same rollouts ended differently without recording, and `CallerError`
+    for a policy other than a tree of places.
     """
+    if not isinstance(learned.policy, Policy):
+        raise CallerError("only a tree of places is studied: leave out --study, or choose --model places")
+    policy = learned.policy
     async with Reading.open(place.url) as reading:
         default, evaluation, held_out = [
             await read_rollouts(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
@@ -411,12 +491,12 @@ async def study(
         evaluator = _Evaluator(experiment, workers, rollouts, report_progress)
         return Study(
             tuple([each async for each in evaluator.curve(default, held_out)]),
-            tuple([await evaluator.compare(scene, learned.policy) for scene in scene_variants(experiment.scene)]),
+            tuple([await evaluator.compare(scene, policy) for scene in scene_variants(experiment.scene)]),
             tuple(
                 cost
                 for cost in (
                     await evaluator.cost(learned.default, default_policy(), default),
-                    await evaluator.cost(learned.evaluation, learned.policy, evaluation),
+                    await evaluator.cost(learned.evaluation, policy, evaluation),
                 )
                 if cost is not None
             ),
@@ -505,7 +585,7 @@ class KitchenResult:
 
 
 async def pick_up_in_kitchen(
-    policy: Policy, place: MemoryLocation, *, seed: int, scene: Scene = KITCHEN
+    policy: AnyPolicy, place: MemoryLocation, *, seed: int, scene: Scene = KITCHEN
 ) -> KitchenResult:
     """Try samples of the policy in order of likelihood until one succeeds, at places that `free_and_visible` allows.
 

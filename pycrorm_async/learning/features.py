@@ -208,7 +208,7 @@ def numbers(frame: pd.DataFrame, name: str, *, optional: bool = False) -> Floats
 
 def _column(frame: pd.DataFrame, name: str) -> Any:
     if name not in frame.columns:
-        raise CallerError(f"the frame has no column {name}: select arm, grasp, {', '.join(PLACE)} of the view")
+        raise CallerError(f"the frame has no column {name}: select arm, grasp, {', '.join(FORMER_PLACE)} of the view")
     return frame[name]
 
 

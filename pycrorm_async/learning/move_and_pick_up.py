@@ -379,25 +379,22 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def drawn(self, rng: np.random.Generator, policy: Policy | None = None) -> MoveAndPickUpPerformable:
         """Return one sample, without regard to obstacles and visibility; `policy` saves `policy_here`.
 
-        Of a `SuccessModel`, one of `DRAWN_FROM` proposals, by its `draws`. Raises `ObjectUnreachable`.
+        Of a `SuccessModel`, one of `DRAWN_FROM` proposals, by its `draws`; where collisions count, one in which the
+        base is clear, if there is any. Raises `ObjectUnreachable`.
         """
         if self._model is None:
             return self.chosen((self.policy_here() if policy is None else policy).sample(rng)[0])
-        context = self._context(self._model)
-        if isinstance(self._model, SuccessModel):
-            return self._predicted(self._model, [self._draw(self._model, rng, context)], context)[0]
-        proposals = self._proposals(self._model, rng, DRAWN_FROM, context, self.policy_here())
-        return self._predicted(self._model, proposals[:1], context)[0]
+        context, clearance = self._context(self._model), base_clearance()
 
-    def _draw(self, model: SuccessModel, rng: np.random.Generator, context: PickUpContext) -> PickUpChoice:
-        """Draw among the proposals until, where collisions count, the base is clear."""
-        proposals = self._lifted(self.policy_here().sample(rng, DRAWN_FROM), rng, context)
-        clearance = base_clearance()
-        for _ in range(DRAWN_FROM):
-            choice = model.draw(rng, proposals, context)
-            if clearance is None or self.is_clear(choice, clearance):
-                return choice
-        raise self._nowhere()
+        def possible(choice: PickUpChoice) -> bool:
+            return clearance is None or self.is_clear(choice, clearance)
+
+        if isinstance(self._model, SuccessModel):
+            proposals = self._lifted(self.policy_here().sample(rng, DRAWN_FROM), rng, context)
+            choice = self._model.draw(rng, proposals, context, possible)
+        else:
+            [choice] = self._polar_ways(self._model, rng, 1, context, self.policy_here())
+        return self._predicted(self._model, [choice], context)[0]
 
     def _ranked(self) -> Iterator[MoveAndPickUpPerformable]:
         choices, rates = self.rated(max(PROPOSALS, self.samples))
@@ -424,7 +421,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             return samples, policy.likelihood(samples)
         context = self._context(model)
         if isinstance(model, PolarPolicy):
-            proposals = self._proposals(model, self._rng, count, context, policy)
+            proposals = self._polar_ways(model, self._rng, count, context, policy)
             return proposals, model.likelihood(proposals, context)
         choices = self._lifted(policy.sample(self._rng, count), self._rng, context)
         return choices, model.probability(choices, context)
@@ -442,17 +439,10 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             raise CallerError(f"{message}, this robot is {robot.body.name}: pass a model of this robot")
         return context_of(objects.in_world(self.target))
 
-    def _proposals(
-        self,
-        model: SuccessModel | PolarPolicy,
-        rng: np.random.Generator,
-        count: int,
-        context: PickUpContext,
-        policy: Policy,
+    def _polar_ways(
+        self, model: PolarPolicy, rng: np.random.Generator, count: int, context: PickUpContext, policy: Policy
     ) -> Sequence[PickUpChoice]:
-        """Return ways to pick up at places of `policy`, the default policy here. Raises `ObjectUnreachable`."""
-        if isinstance(model, SuccessModel):
-            return self._lifted(self._clear_choices(lambda number: policy.sample(rng, number), count), rng, context)
+        """Return samples at places of `policy`, the default policy here. Raises `ObjectUnreachable`."""
 
         def draw(number: int) -> list[PickUpChoice]:
             drawn = model.sample(rng, number, context, policy.evidence)

@@ -1,6 +1,6 @@
 """A policy over polar features: kind of grasp, distance and angle of the base, and the object's height over the torso.
 
->>> policy = learn(successes, features="grasp-polar")
+>>> policy = learn_polar(successes)
 >>> policy.sample(np.random.default_rng(69), 20, PickUpContext(height=0.9, torso_limits=(0.0, 0.33)))
 
 It is a mixture of leaves, as `Policy`, but over the features of `features.py`: both arms and the three grasps from the

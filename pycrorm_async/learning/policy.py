@@ -528,12 +528,17 @@ _CELLS = 120
 
 
 def draw_policies(
-    policies: Mapping[str, Policy], path: Path | str, *, successes: Sequence[PickUpChoice] = (), seed: int = 0
+    policies: Mapping[str, Policy | Sequence[PickUpChoice]],
+    path: Path | str,
+    *,
+    successes: Sequence[PickUpChoice] = (),
+    seed: int = 0,
 ) -> None:
     """Draw the policies side by side under their titles into a file whose suffix sets the format (.png, .svg, .pdf).
 
-    The density over relative_x and relative_y, for all arms and grasps together, is that of 200,000 samples; the dots
-    are the successes. Raises `MissingExtra` without matplotlib, `CallerError` if the file cannot be written.
+    The density over relative_x and relative_y, for all arms and grasps together, is that of 200,000 samples, or of the
+    given ones; the dots are the successes. Raises `MissingExtra` without matplotlib, `CallerError` if the file cannot
+    be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -544,7 +549,7 @@ def draw_policies(
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(policies), squeeze=False)[0]
     for axes, (title, policy) in zip(panels, policies.items(), strict=True):
-        drawn = policy.sample(np.random.default_rng(seed), _SAMPLES)
+        drawn = policy.sample(np.random.default_rng(seed), _SAMPLES) if isinstance(policy, Policy) else policy
         *_, image = axes.hist2d(*_places(drawn), bins=_CELLS, range=(_PLOT_RANGE_M, _PLOT_RANGE_M), density=True)
         figure.colorbar(image, ax=axes, shrink=0.8, label="probability per m²")
         axes.plot(*_places(successes), ".", color="white", markersize=1.2, alpha=0.5)

@@ -16,25 +16,35 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import numpy as np
-from sqlalchemy import Select, and_, func, or_, select
+from sqlalchemy import Select, and_, func, inspect, or_, select
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.learning.features import CIRCUMSTANCES
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import Policy
-from pycrorm_async.orm import BatchRolloutAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import (
+    BatchRolloutAction,
+    MoveAndPickUpAction,
+    PickUpWithContextView,
+    ProcessMetaData,
+    TaskTreeNode,
+)
 from pycrorm_async.plan import objects
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.progress_bar import progress_bar
+from pycrorm_async.projections.derived_views import parameters_of
 from pycrorm_async.query.success import interval_95
 from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
     import pandas as pd
+    from sqlalchemy.sql.selectable import NamedFromClause
 
     from pycrorm_async.memory import Memory
 
@@ -42,20 +52,25 @@ if TYPE_CHECKING:
 #
 # Query the recorded rollouts: index, status, failure, choice, and number of goals set for the hand.
 
+_ROLLOUTS = ("MoveAndPickUpAction", "PredictedPickUpAction")
+"""The types of the nodes of rollouts."""
 STAGES = ("before the pre-pose", "pre-pose", "grasp", "lift")
 """Stages at which a pick-up can fail, indexed by the number of goals its hand was given."""
 
 
-def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Select[Any]:
+def rollouts_question(*, scene: str, seed: int, policy: str | None = None, predicted: bool = False) -> Select[Any]:
     """Select the rollouts that succeeded or failed, ordered by index; interrupted ones are left out.
 
     A data frame of it has the columns policy, index, status, failure, arm, grasp, object_x, object_y, height (as
-    in `MoveAndPickUp.query_for_database`) and goals: the number of goals the hand was given.
+    in `MoveAndPickUp.query_for_database`) and goals: the number of goals the hand was given. If the robot did not reach
+    its place, object_x, object_y and height are missing. With `predicted` it also has the recorded parameters of each
+    rollout as JSON, for `with_parameters`.
     """
-    batch, node, view = BatchRolloutAction, TaskTreeNode, PickUpWithContextView
+    batch, node, view, move = BatchRolloutAction, TaskTreeNode, PickUpWithContextView, MoveAndPickUpAction
     episode = attrgetter("process_metadata_id")
-    tried, picked, moved = aliased(TaskTreeNode), aliased(TaskTreeNode), aliased(TaskTreeNode)
+    tried, picked, moved = aliased(TaskTreeNode, name="tried"), aliased(TaskTreeNode), aliased(TaskTreeNode)
     number = func.row_number().over(partition_by=(episode(tried), node.id), order_by=tried.id)
+    recorded = parameters_of(cast("NamedFromClause", inspect(tried).selectable))
     # Two steps: the subquery selects and numbers the rollouts within their batch, the outer query joins the details.
     ended = (
         select(
@@ -65,10 +80,11 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
             tried.reason,
             batch.policy,
             (batch.first + number - 1).label("index"),
+            *([recorded.label("parameters")] if predicted else ()),
         )
         .join(node, and_(node.id == batch.id, episode(node) == episode(batch)))
         .join(tried, and_(tried.parent_id == node.id, episode(tried) == episode(node)))
-        .where(tried.dtype == "MoveAndPickUpAction", batch.scene == scene, batch.seed == seed)
+        .where(tried.dtype.in_(_ROLLOUTS), batch.scene == scene, batch.seed == seed)
         .where(tried.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
     )
     if policy is not None:
@@ -85,18 +101,38 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
             rollout.c.index,
             rollout.c.status,
             rollout.c.reason.label("failure"),
-            view.arm,
-            view.grasp,
+            move.arm,
+            move.grasp,
             view.robot_in_object_x.label("object_x"),
             view.robot_in_object_y.label("object_y"),
             view.height_over_torso.label("height"),
-            goals.label("goals"),
+            func.coalesce(goals, 0).label("goals"),
+            *([rollout.c.parameters] if predicted else ()),
         )
         .select_from(rollout)
-        .join(picked, and_(picked.parent_id == rollout.c.id, episode(picked) == rollout.c.process_metadata_id))
-        .join(view, and_(view.id == picked.id, episode(view) == episode(picked)))
+        .join(move, and_(move.id == rollout.c.id, episode(move) == rollout.c.process_metadata_id))
+        .outerjoin(
+            picked,
+            and_(
+                picked.parent_id == rollout.c.id,
+                episode(picked) == rollout.c.process_metadata_id,
+                picked.dtype == "PickUpAction",
+            ),
+        )
+        .outerjoin(view, and_(view.id == picked.id, episode(view) == episode(picked)))
         .order_by(rollout.c.index, rollout.c.id)
     )
+
+
+def with_parameters(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the frame with the ways as they were chosen, and their circumstances, for `SuccessModel.fit`.
+
+    The place where the robot stood is replaced by that where it was sent, of which a model must predict the success.
+    """
+    chosen = [msgspec.json.decode(each) for each in frame.pop("parameters")]
+    columns = {"object_x": "relative_x", "object_y": "relative_y", "height": "height", "torso_height": "torso"}
+    columns |= {name: name for name in CIRCUMSTANCES}
+    return frame.assign(**{name: [each.get(own, math.nan) for each in chosen] for name, own in columns.items()})
 
 
 def episodes_question(*, scene: str, seeds: Sequence[int], policies: Sequence[str]) -> Select[str]:

@@ -19,7 +19,7 @@ model is confident of, one at which it is unsure (rounds of learning), or any.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -52,6 +52,8 @@ _TREES: Final = 100
 _LEAVES_MAX: Final = 31
 _ROWS_AT_ONCE: Final = 4_096
 """Bounds the memory of an evaluation: rows times trees numbers at once."""
+_NEVER: Final = 1e-12
+"""The least weight of a draw, so that a way of probability 0 comes last."""
 _LARGEST: Final = float(np.finfo(np.float64).max)
 """Written for an infinite threshold, which JSON has not: every finite number is below it too."""
 
@@ -180,18 +182,26 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
         log_odds = [self.baseline + self._forest.sum(rows[first : first + _ROWS_AT_ONCE]) for first in parts]
         return np.asarray(1 / (1 + np.exp(-np.concatenate([np.zeros(0), *log_odds]))))
 
-    def draw(self, rng: np.random.Generator, proposals: Sequence[PickUpChoice], context: PickUpContext) -> PickUpChoice:
-        """Return one of the proposals, by `draws`."""
+    def draw(
+        self,
+        rng: np.random.Generator,
+        proposals: Sequence[PickUpChoice],
+        context: PickUpContext,
+        possible: Callable[[PickUpChoice], bool] = lambda _: True,
+    ) -> PickUpChoice:
+        """Return one of the proposals, by `draws`: one that is `possible`, if any is."""
         shares = self.probability(proposals, context)
+        chance = rng.random(len(shares))
         match self.draws:
             case Draws.CONFIDENT:
-                weights = (shares >= min(CONFIDENT, shares.max())).astype(np.float64)
+                ranks = np.where(shares >= CONFIDENT, chance - 1, 1 - shares)
             case Draws.UNCERTAIN:
-                weights = shares * (1 - shares) + 0.3 * shares
+                weights = np.maximum(shares * (1 - shares) + 0.3 * shares, _NEVER)
+                ranks = -np.log1p(-chance) / weights  # the order of a weighted draw without replacement
             case Draws.RANDOM:
-                weights = np.ones(len(shares))
-        cumulative = weights.cumsum()
-        return proposals[int(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"))]
+                ranks = chance
+        ordered: list[PickUpChoice] = [proposals[each] for each in np.argsort(ranks, kind="stable")]
+        return next(filter(possible, ordered), ordered[0])
 
     def drawing(self, draws: Draws) -> SuccessModel:
         """Return the same model with another way to draw."""

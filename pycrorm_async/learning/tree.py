@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -28,6 +28,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pycrorm_async.errors import CallerError, MissingExtra, NotEnoughExperience
+from pycrorm_async.learning.features import (
+    FEATURES,
+    GRASP_POLAR,
+    GRASP_POLAR_VERSION,
+    features_of_frame,
+    labels,
+    numbers,
+)
+from pycrorm_async.learning.polar_policy import KINDS, PolarLeaf, PolarPolicy
 from pycrorm_async.learning.policy import ARMS, GRASPS, Floats, Leaf, Linear, Policy
 
 if TYPE_CHECKING:
@@ -64,21 +73,58 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
     """
     check_leaf(min_samples_leaf)
     if len(successes) < min_samples_leaf:
-        message = f"{len(successes)} successes are too few to learn from: a leaf takes {min_samples_leaf}"
-        remedy = "record more rollouts or choose a smaller --min-samples-leaf (min_samples_leaf=)"
-        raise NotEnoughExperience(f"{message}; {remedy}")
-    columns: dict[str, Any] = {name: _labels(successes, name, members) for name, members in SYMBOLS.items()}
+        raise _too_few(len(successes), min_samples_leaf)
+    columns: dict[str, Any] = {
+        name: labels(successes, name, [each.name for each in members]) for name, members in SYMBOLS.items()
+    }
     for name in PLACE:
         own = f"robot_in_{name}"  # the policy's name is that of policy files
-        columns[name] = _numbers(successes, own if own in successes.columns else name)
+        columns[name] = numbers(successes, own if own in successes.columns else name)
     constant_height = None
     if HEIGHT in successes.columns:
-        heights = _numbers(successes, HEIGHT)
+        heights = numbers(successes, HEIGHT)
         if np.ptp(heights) <= HEIGHTS_ALIKE_M:
             constant_height = float(heights[0])
         else:
             columns[HEIGHT] = heights
-    return Policy(tuple(_fit(columns, min_samples_leaf)), constant_height=constant_height)
+    domains = {name: [each.name for each in members] for name, members in SYMBOLS.items()}
+    leaves = (_leaf(weight, fitted) for weight, fitted in _fit(columns, domains, min_samples_leaf))
+    return Policy(tuple(leaves), constant_height=constant_height)
+
+
+def learn_polar(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> PolarPolicy:
+    """Fit a policy over the features "grasp-polar" to successful pick-ups (see `polar_policy`); blocks as `learn`.
+
+    It needs fewer successes than `learn`, because both arms and all grasps from the side share theirs, and it sets the
+    torso. The rows are those of `learn`, with objects at several heights over the torso.
+
+    Raises what `learn` raises, and `CallerError` if all heights are equal.
+    """
+    check_leaf(min_samples_leaf)
+    if len(successes) < min_samples_leaf:
+        raise _too_few(len(successes), min_samples_leaf)
+    rows = features_of_frame(successes)
+    height = rows[:, FEATURES.index("height")]
+    if np.ptp(height) <= HEIGHTS_ALIKE_M:
+        message = f"all objects were {height[0]:.3f} m over the torso, so that a torso height cannot be learned"
+        raise CallerError(f"{message}: record pick-ups at several heights, or learn without features")
+    columns: dict[str, Any] = {"grasp": [KINDS[int(top)] for top in rows[:, FEATURES.index("top")]]}
+    columns |= {name: rows[:, FEATURES.index(name)] for name in ("distance", "angle", "height")}
+    leaves = (
+        PolarLeaf(
+            weight,
+            tuple(float(share) for share in fitted["grasp"].probabilities),  # type: ignore[arg-type]  # two kinds
+            *(_linear(fitted[name].cdf) for name in ("distance", "angle", "height")),
+        )
+        for weight, fitted in _fit(columns, {"grasp": list(KINDS)}, min_samples_leaf)
+    )
+    return PolarPolicy(GRASP_POLAR, GRASP_POLAR_VERSION, tuple(leaves))
+
+
+def _too_few(successes: int, min_samples_leaf: int) -> NotEnoughExperience:
+    message = f"{successes} successes are too few to learn from: a leaf takes {min_samples_leaf}"
+    remedy = "record more rollouts or choose a smaller --min-samples-leaf (min_samples_leaf=)"
+    return NotEnoughExperience(f"{message}; {remedy}")
 
 
 def check_leaf(min_samples_leaf: int) -> None:
@@ -87,12 +133,17 @@ def check_leaf(min_samples_leaf: int) -> None:
         raise CallerError(f"a leaf needs two samples or more, got min_samples_leaf={min_samples_leaf}")
 
 
-def _fit(columns: dict[str, Any], min_samples_leaf: int) -> list[Leaf]:
-    """Fit a tree to the columns and return its leaves. Restores the filters of warnings, which pyjpt changes."""
+def _fit(
+    columns: dict[str, Any], domains: Mapping[str, list[str]], min_samples_leaf: int
+) -> list[tuple[float, dict[str, Any]]]:
+    """Fit a tree and return the weight of each leaf with pyjpt's distributions by column.
+
+    `domains` has the columns of labels. Restores the filters of warnings, which pyjpt changes.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         jpt = _pyjpt()
-        symbols = {name: jpt.SymbolicType(name, [each.name for each in members]) for name, members in SYMBOLS.items()}
+        symbols = {name: jpt.SymbolicType(name, members) for name, members in domains.items()}
         variables = [
             jpt.SymbolicVariable(name, symbols[name]) if name in symbols else jpt.NumericVariable(name)
             for name in columns
@@ -102,7 +153,7 @@ def _fit(columns: dict[str, Any], min_samples_leaf: int) -> list[Leaf]:
         impurity = jpt.Impurity.from_tree(jpt.JPT(variables, min_samples_leaf=min_samples_leaf))
         impurity.setup(samples, order)
         return [
-            _leaf(variables, samples[order[start:end]], (end - start) / len(samples))
+            ((end - start) / len(samples), _distributions(variables, samples[order[start:end]]))
             for start, end in _split(impurity, len(samples))
         ]
 
@@ -127,15 +178,19 @@ def _split(impurity: Any, count: int) -> Iterator[tuple[int, int]]:
             yield start, end
 
 
-def _leaf(variables: Sequence[Any], samples: Floats, weight: float) -> Leaf:
-    """Fit pyjpt's distributions to the rows of one leaf and convert them to a `Leaf`."""
-    distributions = {
+def _distributions(variables: Sequence[Any], samples: Floats) -> dict[str, Any]:
+    """Fit pyjpt's distributions to the rows of one leaf."""
+    return {
         each.name: each.distribution()._fit(samples, col=column)  # noqa: SLF001 - no public method fits both kinds
         for column, each in enumerate(variables)
     }
-    arms, grasps = (tuple(float(share) for share in distributions[name].probabilities) for name in SYMBOLS)
-    x, y = (_linear(distributions[name].cdf) for name in PLACE)
-    return Leaf(weight, arms, grasps, x, y, _linear(distributions[HEIGHT].cdf) if HEIGHT in distributions else None)
+
+
+def _leaf(weight: float, fitted: Mapping[str, Any]) -> Leaf:
+    """Convert pyjpt's distributions to a leaf."""
+    arms, grasps = (tuple(float(share) for share in fitted[name].probabilities) for name in SYMBOLS)
+    x, y = (_linear(fitted[name].cdf) for name in PLACE)
+    return Leaf(weight, arms, grasps, x, y, _linear(fitted[HEIGHT].cdf) if HEIGHT in fitted else None)
 
 
 def _linear(cdf: Any) -> Linear:
@@ -151,30 +206,6 @@ def _linear(cdf: Any) -> Linear:
         knots, cumulative = [knots[0] - JUMP_M, *knots], [0.0, *cumulative]
     rising = np.maximum.accumulate(np.array(cumulative) - cumulative[0])
     return Linear(tuple(knots), tuple((rising / rising[-1]).tolist()))
-
-
-def _labels(successes: pd.DataFrame, name: str, members: Sequence[Enum]) -> list[str]:
-    labels: list[str] = _column(successes, name).tolist()
-    names = [each.name for each in members]
-    if unknown := [label for label in labels if label not in names]:
-        raise CallerError(f"column {name} holds {unknown[0]!r}, which is none of {', '.join(names)}")
-    return labels
-
-
-def _numbers(successes: pd.DataFrame, name: str) -> Floats:
-    try:
-        numbers = _column(successes, name).to_numpy(dtype=np.float64, na_value=np.nan)
-    except (TypeError, ValueError):
-        raise CallerError(f"column {name} holds values that are not numbers") from None
-    if missing := int((~np.isfinite(numbers)).sum()):
-        raise CallerError(f"column {name} has no finite number in {missing} of {len(numbers)} rows: drop those rows")
-    return np.asarray(numbers)
-
-
-def _column(successes: pd.DataFrame, name: str) -> Any:
-    if name not in successes.columns:
-        raise CallerError(f"the frame has no column {name}: select {', '.join((*SYMBOLS, *PLACE))} of the view")
-    return successes[name]
 
 
 def _pyjpt() -> SimpleNamespace:

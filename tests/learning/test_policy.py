@@ -514,6 +514,7 @@ async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_traini
 ) -> None:
     place = MemoryLocation(database_url, tmp_path / "spool")
     learned = await run(SMALL, place)
+    assert isinstance(learned.policy, Policy)
     save_policy(default_policy(), tmp_path / "policy.json")  # what the file holds does not matter
     async with Reading.open(place.url) as reading:
         evaluation = learned.evaluation
@@ -532,6 +533,6 @@ async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_traini
         assert training == set(each.training_episodes)
         assert each.episode_count == len(training) > 1
     again = await run(Experiment(**{**vars(SMALL), "resume": True}), place)
-    assert again.policy.leaves == learned.policy.leaves
+    assert again.policy == learned.policy
     async with Reading.open(place.url) as reading, reading.session() as session:
         assert len((await session.scalars(select(LearnPolicyAction))).all()) == 2

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import pandas as pd
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory
+from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, NotEnoughExperience, PolicyDamaged, PolicyFileRefused
 from pycrorm_async.learning import (
     Draws,
@@ -35,7 +36,10 @@ from pycrorm_async.learning import (
     read_policy,
     save_policy,
 )
+from pycrorm_async.learning.experiment import Experiment, Learned, read_rollouts, run
 from pycrorm_async.learning.features import FEATURES, features_of, features_of_frame, place_of
+from pycrorm_async.learning.pool import MemoryLocation
+from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.success_model import CONFIDENT, Tree
 from pycrorm_async.plan import Retry
 from pycrorm_async.plan.failures import ObjectUnreachable
@@ -347,3 +351,68 @@ def test_where_no_place_is_free_there_is_no_way(stage: Stage) -> None:
 
 _BOX = '<geometry><box size="6 6 0.1"/></geometry>'
 BLOCK = f'<robot name="wall"><link name="wall"><visual>{_BOX}</visual><collision>{_BOX}</collision></link></robot>'
+
+
+# --- rounds ---------------------------------------------------------------------------------------------------------
+
+ROUNDS = Experiment(
+    rollouts=150,
+    rounds=2,
+    evaluate=40,
+    held_out=60,
+    min_samples_leaf=10,
+    scene=Scene(heights=(0.6, 1.2), turned=True),
+    model=Learned.SUCCESS,
+)
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
+async def test_interrupted_rounds_continue_to_the_model_of_rounds_without_an_interruption(
+    database_url: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("sklearn")
+    whole = await run(replace(ROUNDS, workers=2), MemoryLocation(f"sqlite:///{tmp_path}/whole.db", tmp_path / "whole"))
+    assert isinstance(whole.policy, SuccessModel)
+    assert (whole.policy.rollouts, whole.policy.successes) == (300, len(whole.successes))
+    default, second, evaluation, held_out = whole.phases
+    assert default.policy == held_out.policy == name_of(SuccessModel.untrained())
+    assert default.tally.success_rate < 0.35 < second.tally.success_rate
+    assert evaluation.policy == name_of(whole.policy)
+    assert evaluation.tally.success_rate > 0.6
+    assert whole.coverage is not None
+    assert 0.4 < whole.coverage <= 1
+
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(name: str, done: int, _total: int, _tally: Tally) -> None:
+        if name == second.name and done > 30:
+            raise Interrupted
+
+    place = MemoryLocation(database_url, tmp_path / "spool")
+    with pytest.raises(Interrupted):
+        await run(ROUNDS, place, interrupt)
+    resumed = await run(replace(ROUNDS, resume=True), place)
+    assert resumed.default.done_now == 0
+    assert 0 < resumed.phases[1].done_now < 150
+    assert resumed.policy == whole.policy
+    assert [each.tally for each in resumed.phases] == [each.tally for each in whole.phases]
+    async with Reading.open(place.url) as reading:
+        assert await read_policy(reading, second.policy) == (await _model_of(reading, ROUNDS)).drawing(Draws.UNCERTAIN)
+
+
+async def _model_of(reading: Reading, experiment: Experiment) -> SuccessModel:
+    """Return the model fitted to the first round, as it is recorded."""
+    first = name_of(SuccessModel.untrained())
+    frame = await read_rollouts(reading, experiment.scene, first, experiment.seed, experiment.rollouts, predicted=True)
+    return SuccessModel.fit(frame, min_samples_leaf=experiment.min_samples_leaf)
+
+
+@pytest.mark.slow
+async def test_rollouts_whose_base_collides_count_as_failures(tmp_path: Path) -> None:
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db", tmp_path / "spool")
+    colliding = Experiment(rollouts=150, evaluate=1, held_out=1, min_samples_leaf=2, scene=Scene(collisions=True))
+    learned = await run(colliding, place)  # raises `InternalError` if a rollout is missing
+    assert learned.default.tally.failures["NavigationGoalInCollision"] > 0
+    assert learned.default.stages["before the pre-pose"] >= learned.default.tally.failures["NavigationGoalInCollision"]
