@@ -172,6 +172,9 @@ def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) ->
         (("--policy", "\udcff.json"), 2, "cannot be written"),
         (("--policy", "both.png", "--figure", "folder.png/../both.png"), 2, "are both both.png"),
         (("--cluster", "lab"), 2, "no Dask scheduler answers at lab: missing port number"),
+        (("--explore", "random"), 2, "--explore random needs --model success"),
+        (("--model", "polar", "--study", "5"), 2, "--study needs --model places, got --model polar"),
+        (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
         (("--rollouts", "9", "--min-samples-leaf", "10"), 2, "choose a larger --rollouts (rollouts=) or a smaller"),
         # learning/test_experiment shows this one of the function
         pytest.param(("--rollouts", "30"), 2, "successes are too few to learn from", marks=pytest.mark.soak),
