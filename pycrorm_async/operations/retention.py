@@ -17,11 +17,13 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from sqlalchemy import select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.operations.removal import ErasedEpisode, erase
+from pycrorm_async.orm.episodes import EpisodeTag
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialects import dialect_of
@@ -133,21 +135,41 @@ async def remove_rule(log: EventLog, number: int) -> RetentionRule:
 
 
 async def due_episodes(log: EventLog, rules: Sequence[RetentionRule], now_ns: int) -> list[DueEpisode]:
-    """Return the episodes that rules no longer keep at this time, by number."""
+    """Return the episodes that rules no longer keep at this time, by number.
+
+    The tables say which may be due, because an index finds their tags; the log, which may have later ones, decides.
+    """
+    tags_by_number = await _tags_in_tables(log, {tag for each in rules for tag in each.tags})
     due: list[DueEpisode] = []
     for row in await log.episodes():
-        if not any(_is_over(each, row, now_ns) for each in rules):
-            continue
-        tags = await tags_of(log, row) if any(each.tags for each in rules) else ()
-        rule = deciding_rule(rules, tags)
-        if rule is not None and _is_over(rule, row, now_ns):
-            due.append(DueEpisode(row, tags, rule))
+        if _rule_that_ended(rules, tags_by_number.get(row.number, ()), row, now_ns) is not None:
+            tags = await tags_of(log, row)
+            rule = _rule_that_ended(rules, tags, row, now_ns)
+            if rule is not None:
+                due.append(DueEpisode(row, tags, rule))
     return due
 
 
-def _is_over(rule: RetentionRule, row: EpisodeRow, now_ns: int) -> bool:
-    ended_ns, keep_s = row.ended_wall_ns, rule.keep_s
-    return ended_ns is not None and keep_s is not None and ended_ns < now_ns - keep_s * 10**9
+def _rule_that_ended(
+    rules: Sequence[RetentionRule], tags: Collection[str], row: EpisodeRow, now_ns: int
+) -> RetentionRule | None:
+    """Return the rule that decides about an episode, if it no longer keeps it."""
+    if row.ended_wall_ns is None or (rule := deciding_rule(rules, tags)) is None or rule.keep_s is None:
+        return None
+    return rule if row.ended_wall_ns < now_ns - rule.keep_s * 10**9 else None
+
+
+async def _tags_in_tables(log: EventLog, names: Collection[str]) -> dict[int, set[str]]:
+    """Return which of these tags the episodes have, by number, as far as they are folded."""
+    tags: dict[int, set[str]] = {}
+    async with log.reading() as connection:
+        if names and await dialect_of(connection).has_table(connection, "pycrorm_generation"):
+            tag = EpisodeTag.__table__.c
+            for number, name in await connection.execute(
+                select(tag.process_metadata_id, tag.tag).where(tag.tag.in_(sorted(names)))
+            ):
+                tags.setdefault(number, set()).add(name)
+    return tags
 
 
 async def apply_rules(
