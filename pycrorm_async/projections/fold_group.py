@@ -40,6 +40,8 @@ _LOOK_S: Final = 1.0
 _STALL_S: Final = 10.0
 """The time after which a process that has not looked does not count: longer than a batch takes on a busy machine, and
 so short that a flush, which waits for 15 s, does not end before another process has folded what it waits for."""
+_PAUSE_S: Final = 5.0
+"""A process that has not looked itself for this long counts all others again: they may have been stopped with it."""
 
 
 class FoldGroup:
@@ -113,7 +115,8 @@ class FoldGroup:
             await self._end_session()
             raise
         now_s = time.monotonic()
-        seen = {each: self._seen.get(each, (None, 0.0)) for each in looks}
+        known = self._seen if now_s <= self._looked_s + _PAUSE_S else {}
+        seen = {each: known.get(each, (None, 0.0)) for each in looks}
         self._seen = {each: seen[each] if seen[each][0] == look else (look, now_s) for each, look in looks.items()}
         active = [
             each
