@@ -101,6 +101,7 @@ def faults_on(server: Server) -> list[Fault]:
         Fault("foreign declarations, PostgreSQL", declarations.foreign_declarations(on_the_server), 3, 200, 20),
         Fault("failover to an asynchronous replica", restores.failovers(synchronous=False), 2, 200, 20),
         Fault("failover to a synchronous replica", restores.failovers(synchronous=True), 2, 200, 20),
+        Fault("failover by Patroni", restores.failovers_by_patroni, 2, 20, 10),
         Fault("restored PostgreSQL", restores.restored_servers, 2, 200, 50),
         Fault("restored SQLite file", restores.restored_files, 3, 300, 50),
         Fault("all of it at random, simulated", simulation.simulated, 15, 1_000, 100),

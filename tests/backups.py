@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
+import socket
 import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 from urllib.parse import urlsplit
 
 import asyncpg
+import psutil
 
 from tests.databases import Server, ask, server_in
 
@@ -200,3 +203,142 @@ def replicas_in(folder: Path, *, synchronous: bool) -> Iterator[Replicas]:
             yield replicas
         finally:
             replicas.stop()
+
+
+# === Patroni ==================================================================================================
+#
+# Two servers, of which Patroni promotes one when the other's machine dies, with etcd as its memory of who leads.
+
+PATRONI_PACKAGES: Final = "Debian's patroni and etcd-server"
+_LEADER: Final = "SELECT NOT pg_is_in_recovery()"
+
+
+def has_patroni() -> bool:
+    return all(shutil.which(each) for each in ("patroni", "etcd"))
+
+
+class PatroniCluster:
+    """Two nodes below a folder with a short path, each a Patroni with its server. Use as a context manager."""
+
+    def __init__(self, folder: Path, programs: Server) -> None:
+        self._folder = folder
+        self._programs, self._user = programs.programs, programs.system_user
+        self._ports = [free_port() for _ in range(2)]
+        self._etcd = f"http://127.0.0.1:{free_port()}"
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._dead: int | None = None
+
+    def url(self, database: str = "postgres") -> str:
+        """The URL of the node that leads, whichever that is."""
+        hosts, ports = ",".join(["127.0.0.1"] * 2), ",".join(map(str, self._ports))
+        return f"postgresql://postgres@/{database}?host={hosts}&port={ports}&target_session_attrs=read-write"
+
+    def __enter__(self) -> Self:
+        if self._user is not None:  # servers refuse to run as root
+            shutil.chown(self._folder, self._user)
+        self._folder.chmod(0o755)
+        peers = f"http://127.0.0.1:{free_port()}"
+        client = ("--listen-client-urls", self._etcd, "--advertise-client-urls", self._etcd)
+        peer = ("--listen-peer-urls", peers, "--initial-advertise-peer-urls", peers)
+        among = ("--initial-cluster", f"default={peers}")
+        self._run("etcd", "etcd", "--data-dir", self._folder / "etcd", *client, *peer, *among)
+        try:
+            for number in range(2):
+                self._start(number)
+                self._until(number, "SELECT true")
+            self._until_both()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number in range(2):
+            self._kill(number)
+        self._processes.pop("etcd").kill()
+
+    def fail_over(self) -> None:
+        """Kill all processes of the node that leads, as a power cut does, and wait until the other one leads."""
+        [leader] = [each for each in range(2) if self._answers(each, _LEADER)]
+        self._kill(leader)
+        self._dead = leader
+        self._until(1 - leader, _LEADER)
+
+    def follow(self) -> None:
+        """Start the dead node, which becomes the other one's replica."""
+        assert self._dead is not None
+        self._start(self._dead)
+        self._until_both()
+
+    def _until_both(self) -> None:
+        leads = [self._answers(each, _LEADER) for each in range(2)]
+        self._until(leads.index(True), "SELECT count(*) > 0 FROM pg_stat_replication WHERE state = 'streaming'")
+
+    def _start(self, number: int) -> None:
+        api, server = f"127.0.0.1:{free_port()}", f"127.0.0.1:{self._ports[number]}"
+        trusted = [f"{kind} all 127.0.0.1/32 trust" for kind in ("host all", "host replication")]
+        first = {
+            "dcs": {"ttl": 20, "loop_wait": 1, "retry_timeout": 5, "postgresql": {"parameters": {"fsync": "off"}}},
+            "initdb": [{"encoding": "UTF8"}, {"auth": "trust"}],
+            "pg_hba": ["local all all trust", *trusted],
+        }
+        who = {"username": "postgres"}
+        settings = {
+            "scope": "memory",
+            "name": f"node{number}",
+            "restapi": {"listen": api, "connect_address": api},
+            "etcd3": {"host": self._etcd.removeprefix("http://")},
+            "bootstrap": first,
+            "postgresql": {
+                "listen": server,
+                "connect_address": server,
+                "data_dir": str(self._folder / f"data{number}"),
+                "bin_dir": str(self._programs),
+                "authentication": {"superuser": who, "replication": who},
+                "parameters": {"unix_socket_directories": str(self._folder)},
+                "remove_data_directory_on_diverged_timelines": True,
+            },
+        }
+        file = self._folder / f"node{number}.yml"
+        file.write_text(json.dumps(settings))  # which YAML contains
+        self._run(f"node{number}", "patroni", file)
+
+    def _kill(self, number: int) -> None:
+        process = self._processes.pop(f"node{number}", None)
+        if process is None:
+            return
+        processes = [psutil.Process(process.pid)]
+        with contextlib.suppress(FileNotFoundError, psutil.NoSuchProcess):
+            pid = int((self._folder / f"data{number}/postmaster.pid").read_text().split()[0])
+            processes.append(psutil.Process(pid))
+        for each in processes:
+            each.suspend()
+        for each in [child for parent in processes for child in parent.children(recursive=True)] + processes:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                each.kill()
+        process.wait()
+
+    def _run(self, name: str, *command: str | Path) -> None:
+        environment = {"PATH": f"{self._programs}:/usr/bin:/bin", "HOME": str(self._folder), "LC_ALL": "C.UTF-8"}
+        with (self._folder / f"{name}.log").open("ab") as log:
+            self._processes[name] = subprocess.Popen(
+                list(map(str, command)), user=self._user, stdout=log, stderr=log, cwd=self._folder, env=environment
+            )
+
+    def _answers(self, number: int, question: str) -> bool:
+        with contextlib.suppress(OSError, asyncpg.PostgresError):
+            return bool(ask(f"postgresql://postgres@127.0.0.1:{self._ports[number]}/postgres", question)[0][0])
+        return False
+
+    def _until(self, number: int, question: str) -> None:
+        deadline = time.monotonic() + 120
+        while not self._answers(number, question):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{question}: {(self._folder / f'node{number}.log').read_text()[-2000:]}")
+            time.sleep(0.1)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port: int = listener.getsockname()[1]
+        return port

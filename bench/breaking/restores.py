@@ -25,7 +25,7 @@ from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.backups import Backup, replicas_in
+from tests.backups import PATRONI_PACKAGES, Backup, PatroniCluster, Replicas, has_patroni, replicas_in
 from tests.databases import Server, ask, server_in
 
 # === restores =================================================================================================
@@ -139,18 +139,8 @@ def failovers(*, synchronous: bool) -> Callable[[int, random.Random, Path, Step]
 
     async def run_all(outcome: Outcome, rounds: int, rng: random.Random, step: Step, place: Path, spool: Path) -> None:
         with replicas_in(place, synchronous=synchronous) as replicas:
-            ask(replicas.url(), "CREATE DATABASE memory")
-            url = replicas.url("memory")
-            async with Memory.open(url, spool=spool, settings=_SETTINGS) as memory:
-                for _ in range(rounds):
-                    await _record(memory, rng)
-                    await memory.flush()
-                    if not synchronous:
-                        await asyncio.to_thread(replicas.lag)
-                    async with _set_back(memory, rng, replicas.fail_over, url) as state:
-                        await _check(outcome, state, url, rounds=rounds)
-                    await asyncio.to_thread(replicas.follow)
-                    step()
+            before = None if synchronous else replicas.lag
+            await _failing_over(replicas, outcome, rounds, rng, step, spool, before=before)
 
     def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         standby = "confirms every COMMIT" if synchronous else "no longer receives changes"
@@ -162,6 +152,47 @@ def failovers(*, synchronous: bool) -> Callable[[int, random.Random, Path, Step]
         return outcome
 
     return run
+
+
+async def _failing_over(
+    replicas: Replicas | PatroniCluster,
+    outcome: Outcome,
+    rounds: int,
+    rng: random.Random,
+    step: Step,
+    spool: Path,
+    *,
+    before: Callable[[], None] | None = None,
+) -> None:
+    """Fail over under an open memory in each round, after calling `before`."""
+    ask(replicas.url(), "CREATE DATABASE memory")
+    url = replicas.url("memory")
+    async with Memory.open(url, spool=spool, settings=_SETTINGS) as memory:
+        for _ in range(rounds):
+            await _record(memory, rng)
+            await memory.flush()
+            if before is not None:
+                await asyncio.to_thread(before)
+            async with _set_back(memory, rng, replicas.fail_over, url) as state:
+                await _check(outcome, state, url, rounds=rounds)
+            await asyncio.to_thread(replicas.follow)
+            step()
+
+
+def failovers_by_patroni(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """Kill a node of two with all its processes; Patroni promotes the other, which the URL names too."""
+    outcome = Outcome(note="PostgreSQL: SIGKILL of Patroni and the primary; Patroni promotes the replica after 20 s")
+    if not has_patroni():
+        outcome.note = f"skipped: {PATRONI_PACKAGES} are not installed"
+        return outcome
+    with (
+        tempfile.TemporaryDirectory(prefix="pg") as place,
+        server_in(Path(place), syncs=False) as programs,
+        tempfile.TemporaryDirectory(prefix="pat") as name,
+        PatroniCluster(Path(name), programs) as cluster,
+    ):
+        asyncio.run(_failing_over(cluster, outcome, rounds, rng, step, folder / "spool"))
+    return outcome
 
 
 def restored_servers(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:

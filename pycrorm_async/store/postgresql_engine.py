@@ -62,7 +62,7 @@ def refusal_of_url(url: URL) -> str | None:
         return "an @ in a password is written %40"
     if not url.database:
         return "a PostgreSQL URL names its database"
-    ports = [url.port, *(_number(each) for each in url.normalized_query.get("port", ()))]
+    ports = [url.port, *map(_number, ",".join(url.normalized_query.get("port", ("5432",))).split(","))]
     if any(port is not None and not 0 < port < 2**16 for port in ports):
         return "a port is a number from 1 to 65535"
     if not set(url.query) <= set(_PARAMETERS):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from sqlalchemy import func, select
@@ -130,6 +131,17 @@ async def test_a_replica_that_does_not_answer_is_replaced_by_the_memory_and_anot
         with pytest.raises(CallerError, match=r"holds another memory|is no replica of"):
             async with Reading.open(url, read_url=wrong):
                 pass
+
+
+async def test_a_url_may_name_both_servers_and_leads_to_the_one_that_takes_writes(
+    replicas: Replicas, database: str, tmp_path: Path
+) -> None:
+    hosts = [urlsplit(each).query.removeprefix("host=") for each in (replicas.standby_url(), replicas.url())]
+    for number, order in enumerate((hosts, hosts[::-1])):
+        url = f"postgresql://postgres@/{database}?host={','.join(order)}&port=5432,5432&target_session_attrs=read-write"
+        async with Memory.open(url, spool=tmp_path / "spool", settings=SETTINGS) as memory:
+            await record(memory, number)
+            assert await steps(memory) == [*range(number + 1)]
 
 
 def test_each_reading_verb_answers_from_a_replica_alone(replicas: Replicas, database: str, tmp_path: Path) -> None:
