@@ -149,7 +149,7 @@ def html_page(document: Mapping[str, Any], heading: str, suffix: str, body: str,
         "policy": policy,
         "title": html.escape(visible(heading, kept="") + suffix),
         "style": style,
-        "body": body.replace("{heading}", html.escape(heading)),
+        "body": body.replace("{heading}", html.escape(visible(heading, kept=""))),
         "document": _safe_json(document),
         "scripts": "\n".join(f"<script>{each}</script>" for each in scripts),
     }

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
+from pycrorm_async.visible_text import visible
 from pycrorm_async.world.pose import Pose
 from tests.report.browser import Browser
 
@@ -74,7 +75,7 @@ def test_the_page_of_two_episodes_marks_what_differs_in_aligned_trees(
         ]  # fmt: skip
         assert f"slipped {HOSTILE}" not in tab.ask("document.getElementById('nodes').innerHTML")
         facts = tab.ask("document.getElementById('differences').textContent")
-        assert f"take it {HOSTILE}" in facts
+        assert f"take it {visible(HOSTILE)}" in facts
         assert "object milk(0.000, 0.000, 0.000)(1.000, 0.000, 0.000)place" in facts
         captions = "[...document.querySelectorAll('.twin > .hint')].map((each) => each.textContent.split('event ')[1])"
         ends = tab.ask(captions)

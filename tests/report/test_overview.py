@@ -109,7 +109,7 @@ def test_groups_have_their_success_and_two_of_them_are_compared(chrome: Browser,
         assert compared[1].endswith("-50 (-91 to +19)")
         assert tab.problems() == []
         causes = "[...document.querySelectorAll('#reasons tr')].map((each) => each.textContent)"
-        assert tab.ask(causes)[0].startswith("1slipped </script><b onload=alert(#)>\u202e in GraspAction 1 ")
+        assert tab.ask(causes)[0].startswith("1slipped </script><b onload=alert(#)><U+202E> in GraspAction 1 ")
         tab.ask("document.querySelector('#reasons button').click()")
         assert tab.ask(ROWS) in (["4"], ["6"])
         tab.ask("pycrormOverview.settings.set({ cause: '', vs: ['a', 'b'], of: '' })")

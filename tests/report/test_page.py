@@ -6,12 +6,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pycrorm_async import world_of
 from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.report import overview as overviews
 from pycrorm_async.report.write import report
 from pycrorm_async.world import Pose
 from tests.commands import pycrorm
@@ -680,6 +682,39 @@ async def test_control_characters_are_signs_in_titles_and_hints(chrome: Browser,
         assert "\u202e" not in text
         assert "turtle<U+202E>" in text
         assert "<U+202E>]]>" in text
+
+
+@pytest.mark.parametrize("width", [390, 800, 1400])
+async def test_long_names_and_control_characters_leave_room_for_the_rest(
+    chrome: Browser, tmp_path: Path, width: int
+) -> None:
+    long = "a\x01\u202e<b>" + "n" * 300
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    with Memory.sync(url) as memory:
+        look = memory.recording.type("action", "LookAction", {})
+        with memory.recording.episode(description=long) as episode:
+            episode.object_added("robot", long, "ROBOT", Pose([0, 0, 0]))
+            episode.object_added("milk", f"{long} milk", "MILK", Pose([1, 0, 0.5]))
+            episode.object_attached("robot", "milk", long)
+            episode.start("look", look, robot="robot")
+            episode.observe(long, {long: np.zeros((16, 16, 3), np.uint8)}, node="look")
+            episode.end("look", failure=(long, long))
+        memory.flush()
+    async with Reading.open(url) as reading:
+        await report(reading, 1, tmp_path / "page.html")
+        await overviews.overview(reading, tmp_path / "all.html")
+    shown = "#facts > *, #notes p, #legend > *, #views button, .seen-row > bdi, #episodes bdi"
+    boxes = f"[...document.querySelectorAll('{shown}')].map((each) => each.getBoundingClientRect())"
+    for name in ("page", "all"):
+        with chrome.open(tmp_path / f"{name}.html", width=width) as tab:
+            assert tab.ask("document.documentElement.scrollWidth") == width
+            text = tab.ask("document.body.innerText")
+            assert "\u202e" not in text
+            assert "a␁<U+202E><b>nnn" in text
+            assert max(tab.ask(f"{boxes}.map((each) => each.height)")) < 60
+            assert tab.ask(f"{boxes}.filter((each) => each.left < 0 || each.right > innerWidth).length") == 0
+            if name == "all":  # rows of a short list are not stretched over the window
+                assert tab.ask("document.querySelector('#filters').getBoundingClientRect().height") < 250
 
 
 def test_a_capsule_has_round_ends(chrome: Browser, pages: dict[str, Path]) -> None:

@@ -20,7 +20,7 @@ export function element(tag, attributes = {}, ...children) {
 }
 
 /** Recorded text in an element of its own direction, so that right-to-left text does not reorder its surroundings. */
-export const recorded = (text, attributes = {}) => element("bdi", attributes, String(text));
+export const recorded = (text, attributes = {}) => element("bdi", attributes, plain(text));
 
 /** Replace what is in a holder; a focused control keeps the focus if the new content has it too, else the holder gets it. */
 export function replaceIn(holder, ...children) {

@@ -1,7 +1,7 @@
 // Keeps in the address of the page which episodes are chosen, and shows it as a row of controls above them.
 
 import { causeName } from "./counts.js";
-import { element, offer, plain } from "./dom.js";
+import { element, offer, plain, recorded } from "./dom.js";
 
 const OPTIONS_MAX = 200;
 const DAY_S = 86_400;
@@ -100,7 +100,7 @@ export class Filters {
     }
     this.clear.hidden = !chosen;
     this.cause.hidden = this.settings.get("cause") === "";
-    this.cause.replaceChildren("failed by ", element("bdi", {}, this.settings.get("cause")), " ✕");
+    this.cause.replaceChildren("failed by ", recorded(this.settings.get("cause")), " ✕");
   }
 
   /** The episodes that fulfil all conditions. */

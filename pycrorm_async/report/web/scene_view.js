@@ -1,7 +1,7 @@
 // Draws the world after an event with WebGL: bodies, the paths of the current action, names; and shows what is pointed at.
 
 import { heldName, namedOf } from "./bodies.js";
-import { colorOf, element } from "./dom.js";
+import { colorOf, element, recorded } from "./dom.js";
 import { pointsOfEpisode, pointsOfMoment } from "./extent.js";
 import { rodAlong } from "./path_lines.js";
 import { SceneCamera } from "./scene_camera.js";
@@ -87,7 +87,7 @@ export class SceneView {
       const body = this.pointed ? this.#bodyAt(this.pointed) : undefined;
       const { offsetX, offsetY } = this.pointed ?? {};
       this.pointed = null;
-      this.hint.replaceChildren(...(body === undefined ? [] : [element("bdi", {}, body.object.name), ` ${body.object.type}`]));
+      this.hint.replaceChildren(...(body === undefined ? [] : [recorded(body.object.name), ` ${body.object.type}`]));
       if (body !== undefined) Object.assign(this.hint.style, { left: `${offsetX + 14}px`, top: `${offsetY + 14}px` });
       this.renderer.domElement.style.cursor = body === undefined ? "grab" : "pointer";
     });
@@ -254,7 +254,7 @@ export class SceneView {
       top.project(this.camera.camera);
       const middle = box.getCenter(new THREE.Vector3()).project(this.camera.camera);
       if (Math.max(Math.abs(middle.x), Math.abs(middle.y), Math.abs(middle.z)) > 1) continue;
-      const label = element("span", { class: object === this.chosen ? "chosen" : null }, element("bdi", {}, heldName(object, held)));
+      const label = element("span", { class: object === this.chosen ? "chosen" : null }, recorded(heldName(object, held)));
       labels.push({ label, x: ((top.x + 1) / 2) * width, y: ((1 - top.y) / 2) * height - 4 });
     }
     this.names.replaceChildren(...labels.map((each) => each.label));

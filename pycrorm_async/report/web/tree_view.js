@@ -1,7 +1,7 @@
 // Shows the task tree as a list of rows, of which only those in sight are elements: a tree may have 100,000 nodes.
 
 import { signOf } from "./episode.js";
-import { duration, element, HUES, recorded } from "./dom.js";
+import { HUES, duration, element, plain, recorded } from "./dom.js";
 
 const ROW_PX = 26;
 const OPEN_MAX = 300;
@@ -241,7 +241,7 @@ export class TreeView {
     const hidden = !open && node.children.length > 0 ? element("span", { class: "count" }, `${node.children.length}`) : null;
     const inside = !open && node.holdsFailure && !node.failed ? element("span", { class: "count bad" }, "✗ inside") : null;
     const took = node.end ? duration(this.episode.secondsAt(node.end) - this.episode.secondsAt(node.start)) : "";
-    const spoken = (text) => (text ? element("span", { class: "spoken" }, `, ${text.slice(0, HINT_MAX)} `) : null);
+    const spoken = (text) => (text ? element("span", { class: "spoken" }, `, ${plain(text.slice(0, HINT_MAX))} `) : null);
     return element(
       "div",
       {
