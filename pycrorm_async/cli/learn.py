@@ -19,9 +19,11 @@ import typer
 
 from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import JsonOption, note, print_facts, print_json, print_table
-from pycrorm_async.cli.reading import DEFAULT_URL, Place
+from pycrorm_async.cli.policy import print_card
+from pycrorm_async.cli.reading import DEFAULT_URL, Place, ReadingPlace
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
+from pycrorm_async.learning import remembered
 from pycrorm_async.learning.experiment import (
     KITCHEN,
     Experiment,
@@ -36,11 +38,13 @@ from pycrorm_async.learning.experiment import (
 )
 from pycrorm_async.learning.features import PickUpContext
 from pycrorm_async.learning.policy import Policy, default_policy, draw_policies
+from pycrorm_async.learning.policy_cards import PolicyCard, read_card
 from pycrorm_async.learning.policy_file import name_of, save_policy
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scenes import Scene
 from pycrorm_async.learning.success_model import Draws, SuccessModel
+from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.engines import engine_class
@@ -58,12 +62,12 @@ def learn(
         int, typer.Option(min=1, help="Rounds: the first acts at random, each further one by the latest policy.")
     ] = 1,
     model: Annotated[
-        Learned,
+        Learned | None,
         typer.Option(
-            help="What is learned: a tree of places, as in the thesis; a tree of polar features, which sets the torso;"
-            " or a model of success, which learns from failures too.",
+            help="What is learned: a tree of places, as in the thesis (the default); a tree of polar features, which"
+            " sets the torso; or a model of success, which learns from failures too (the default of --from-memory).",
         ),
-    ] = Learned.PLACES,
+    ] = None,
     explore: Annotated[
         Draws | None,
         typer.Option(
@@ -120,6 +124,18 @@ def learn(
             " heights and objects; collisions; the cost of recording.",
         ),
     ] = 0,
+    from_memory: Annotated[
+        bool,
+        typer.Option("--from-memory", help="Learn from all pick-ups in the memory, also of real robots; try nothing."),
+    ] = False,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN=TEXT",
+            help="With --from-memory, the pick-ups to learn from, by robot, object, arm, grasp, policy, description,"
+            " scene or kind, of which there must be one.",
+        ),
+    ] = None,
     policy: Annotated[Path, typer.Option(help="File for the learned policy.")] = Path("policy.json"),
     figure: Annotated[Path, typer.Option(help="File for the figure of both policies: .png, .svg or .pdf.")] = Path(
         "policies.png"
@@ -129,6 +145,10 @@ def learn(
 ) -> None:
     """Record random pick-ups, learn a policy from the successful ones, and evaluate it.
 
+    With --from-memory, learn from what is recorded already, of one kind: robot, simulated or real, limits, collisions,
+    disturbance. A model of success learns from the failures too. The policy is recorded with its training episodes and
+    its evaluation on pick-ups held out by seed, height, object and scene; `pycrorm policy` shows it.
+
     The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra 'learning'. On the
     machines of a --cluster (extra 'cluster') each worker records into the spool of its machine, which a `pycrorm
     writer` there stores; the same rollouts end alike with any number of workers.
@@ -137,6 +157,16 @@ def learn(
     # that of the packages comes last, because importing them takes half a second.
     DatabaseAddress.parse(place.url)
     _check_files(policy, figure)
+    if from_memory:
+        if resume or study_rollouts or episode_each or collisions:
+            raise CallerError("--from-memory tries nothing: leave out --resume, --study, --episode-each, --collisions")
+        kind = model or Learned.SUCCESS
+        leaf = LEAVES[kind] if min_samples_leaf is None else min_samples_leaf
+        _learn_from_memory(_conditions(where or []), policy, place, kind, leaf, as_json=as_json)
+        return
+    if where:
+        raise CallerError("--where belongs to --from-memory")
+    model = model or Learned.PLACES
     if explore is not None and model is not Learned.SUCCESS:
         raise CallerError(f"--explore {explore} needs --model success: other policies try as they act")
     if study_rollouts and model is not Learned.PLACES:
@@ -181,6 +211,37 @@ def learn(
     _print(learned, in_kitchen, studied)
     option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(place.address.to_type)}"
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
+
+
+def _conditions(where: list[str]) -> dict[str, str]:
+    """Read the conditions of --where. Raises `CallerError`."""
+    conditions: dict[str, str] = {}
+    for each in where:
+        column, sign, text = each.partition("=")
+        if not sign:
+            raise CallerError(f"--where {each[:60]!r} is not a condition: write COLUMN=TEXT, as object=MILK")
+        conditions[column] = text
+    return conditions
+
+
+def _learn_from_memory(
+    where: dict[str, str], file: Path, place: Place, model: Learned, min_samples_leaf: int, *, as_json: bool
+) -> None:
+    tries = remembered.select_tries(ReadingPlace(*place).read(remembered.read_tries), where)
+    with progress_bar("learning", unit="fits") as bar:
+        learned = remembered.learn_remembered(tries, model, min_samples_leaf=min_samples_leaf, report_progress=bar)
+
+    async def record() -> PolicyCard:
+        async with Memory.open(place.url, spool=place.spool) as memory:
+            return await read_card(memory.reading, await remembered.record_remembered(memory, learned))
+
+    card = asyncio.run(record())
+    save_policy(learned.policy, file)
+    if as_json:
+        print_json({"file": str(file), "card": card})
+        return
+    print_card(card)
+    note(f"The policy is in {file}. Next: MoveAndPickUp(target, policy=load_policy({str(file)!r}))")
 
 
 def _middle(scene: Scene) -> PickUpContext:

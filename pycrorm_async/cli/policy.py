@@ -47,12 +47,13 @@ def policy(
     if as_json:
         print_json(card)
         return
-    _print(card)
+    print_card(card)
     if out is not None:
         note(f"The policy is in {out}.")
 
 
-def _print(card: PolicyCard) -> None:
+def print_card(card: PolicyCard) -> None:
+    """Print the card of a policy, as tables."""
     summary, evaluation = card.summary, card.evaluation
     facts: dict[str, object] = {
         "kind": summary.kind if card.size is None else f"{summary.kind} of {card.size:,}",

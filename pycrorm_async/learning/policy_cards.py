@@ -67,7 +67,7 @@ class Training:
         learned_at: the moment.
         successes: number of samples that succeeded.
         rollouts, scene, seeds: of the rollouts that gave the samples; None and empty if they come from other episodes.
-        rounds: the number of rounds of rollouts.
+        rounds: the number of rounds of rollouts; 0 without.
         episodes: number of the episodes with samples; `episode_ids` are those of the first 10,000.
     """
 
@@ -88,7 +88,8 @@ class PolicySummary:
 
     Attributes:
         kind: `tree`, `polar tree`, `success model`, or `default policy`; `not held` if only its name is recorded.
-        robots, objects: names of the robots that used it, and types of the objects that they picked up by it.
+        robots, objects: names of the robots that it is for or that used it, and types of the objects that these picked
+            up by it.
         learned_from: number of pick-ups that it was learned from; None if that is not recorded.
         used: number of actions that name it.
         succeeded: how those ended that succeeded or failed.
@@ -131,8 +132,8 @@ async def read_policies(reading: Reading) -> list[PolicySummary]:
     """Return the policies that a memory names or holds, the latest learned first, then by name."""
     names = await recorded_names(reading)
     uses, trainings = await _uses(reading), await _trainings(reading)
-    kinds = {name: (await _held(reading, name))[0] for name in names | uses.keys() | trainings.keys()}
-    summaries = [_summary(name, kind, uses.get(name, ()), trainings.get(name, ())) for name, kind in kinds.items()]
+    held = {name: await _held(reading, name) for name in names | uses.keys() | trainings.keys()}
+    summaries = [_summary(name, *each, uses.get(name, ()), trainings.get(name, ())) for name, each in held.items()]
     return sorted(summaries, key=lambda each: (-(each.learned_at.timestamp() if each.learned_at else 0), each.name))
 
 
@@ -149,7 +150,7 @@ async def read_card(reading: Reading, name: str) -> PolicyCard:
             if each.scene is not None:
                 scenes[each.scene][each.succeeded] += each.times
     return PolicyCard(
-        _summary(full, kind, uses, trainings),
+        _summary(full, kind, policy, uses, trainings),
         _features(policy),
         None if policy is None else len(policy.trees if isinstance(policy, SuccessModel) else policy.leaves),
         tuple(trainings),
@@ -220,7 +221,8 @@ async def _trainings(reading: Reading, name: str | None = None) -> dict[str, lis
             seeds = tuple(each.seeds)
             record = Training(
                 each.start_time, each.successes, each.min_samples_leaf, each.rollouts, each.scene, seeds,
-                len(seeds), each.episode_count, tuple(each.training_episodes) if name is not None else (),
+                len(seeds) if each.rollouts else 0, each.episode_count,
+                tuple(each.training_episodes) if name is not None else (),
             )  # fmt: skip
             records.setdefault(each.policy, []).append(record)
     return records
@@ -249,7 +251,9 @@ def _features(policy: AnyPolicy | None) -> str:
     return f"arm, grasp, place{', height over the torso' if has_height else ''}{height}"
 
 
-def _summary(name: str, kind: str, uses: Iterable[_Use], trainings: Sequence[Training]) -> PolicySummary:
+def _summary(
+    name: str, kind: str, policy: AnyPolicy | None, uses: Iterable[_Use], trainings: Sequence[Training]
+) -> PolicySummary:
     counts, used = Counter[bool](), 0
     robots, objects = set[str](), set[str]()
     for each in uses:
@@ -260,6 +264,9 @@ def _summary(name: str, kind: str, uses: Iterable[_Use], trainings: Sequence[Tra
             counts[each.succeeded] += each.times
     latest = trainings[0] if trainings else None
     learned_from = None if latest is None else latest.rollouts or latest.successes
+    if isinstance(policy, SuccessModel):
+        learned_from = policy.rollouts
+        robots |= {policy.robot} if policy.robot else set()
     return PolicySummary(
         name, kind, tuple(sorted(robots)), tuple(sorted(objects)), learned_from, used, _share(counts),
         latest.learned_at if latest else None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -77,6 +78,30 @@ def test_the_memory_lists_its_policies_and_writes_their_files(document: Any, fol
     refused = pycrorm("policy", "nothing", cwd=folder)
     assert "the memory names no policy 'nothing'" in one_line_of(refused)
     assert refused.returncode == 2
+
+
+def test_a_policy_is_learned_from_one_kind_of_what_is_remembered(document: Any, folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "pycrorm.db", tmp_path)
+    mixed = pycrorm("learn", "--from-memory", cwd=tmp_path)
+    assert "2 kinds of pick-ups are remembered" in one_line_of(mixed)
+    assert "--where 'kind=pr2, simulated, soft limits'" in one_line_of(mixed)
+    assert mixed.returncode == 2
+    wanted = "learn", "--from-memory", "--where", "kind=pr2, simulated, soft limits"
+    card = answer(*wanted, "--model", "places", "--policy", "tree.json", cwd=tmp_path)["card"]
+    tried = document["phases"]
+    assert card["trainings"][0]["successes"] == sum(each["successes"] for each in tried)
+    assert {each["by"] for each in card["evaluation"]["held_out"]} == {"random", "seed"}
+    assert name_of(load_policy(tmp_path / "tree.json")) == card["summary"]["name"]
+    assert answer("policy", card["summary"]["name"], cwd=tmp_path) == card
+    for arguments, message in (
+        (("--where", "kind"), "is not a condition: write COLUMN=TEXT"),
+        (("--where", "thing=milk"), "pick-ups have no column 'thing' to choose by"),
+        (("--where", "object=BOWL"), "no pick-up is remembered that succeeded or failed, with object BOWL"),
+        (("--resume",), "--from-memory tries nothing"),
+    ):
+        refused = pycrorm("learn", "--from-memory", *arguments, cwd=tmp_path)
+        assert message in one_line_of(refused)
+    assert "belongs to --from-memory" in one_line_of(pycrorm("learn", "--where", "object=MILK", cwd=tmp_path))
 
 
 @pytest.mark.soak
