@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.events.types import EpisodeTagged
+from pycrorm_async.operations.copy import _append
 from pycrorm_async.operations.retention import (
     RetentionRule,
     add_rule,
@@ -112,6 +115,24 @@ async def test_what_no_rule_keeps_goes_and_what_runs_or_is_kept_by_its_tag_stays
         assert [(each.removed.number, each.left) for each in finished.erased] == [(1, ()), (3, ())]
         assert places_with("Amsel", database_url) == []
     await assert_clean(database_url)
+
+
+@pytest.mark.slow
+async def test_a_tag_that_is_not_in_the_tables_yet_keeps_its_episode(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url) as memory, memory.episode(description="old"):
+        pass
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        await add_rule(log, "1d", timedelta(days=1), (), None)
+        await add_rule(log, "forever", None, ("keep",), None)
+        rules, [row] = await read_rules(log), await log.episodes()
+        assert [each.row.number for each in await due_episodes(log, rules, 2**62)] == [1]
+        await _append(log, row, EpisodeTagged(("keep",), ()), SYSTEM_CLOCK)
+        assert ask(url, "SELECT folded < head FROM episode") == [(1,)]
+        assert await due_episodes(log, rules, 2**62) == []
+    finally:
+        await log.close()
 
 
 @pytest.mark.slow
