@@ -61,7 +61,7 @@ export class MapView {
     const outlined = present.filter(({ body }) => named.includes(body));
     for (const { x, y, size, name } of labelsOf(outlined, this.episode.heldAt(event), scale * 2.2, left, right)) {
       const label = svg("text", { x, y: -y, "font-size": size, "text-anchor": "middle" });
-      label.textContent = plain(name);
+      label.textContent = name;
       picture.append(label);
     }
     this.holder.replaceChildren(picture);
@@ -93,7 +93,8 @@ function labelsOf(bodies, held, size, left, right) {
     const points = outlines.flatMap(({ hull }) => hull);
     if (points.length === 0) points.push([body.group.position.x, body.group.position.y]);
     const [xs, ys] = [points.map(([x]) => x), points.map(([, y]) => y)];
-    const name = heldName(body.object, held);
+    const [whole, letters] = [plain(heldName(body.object, held)), Math.floor((right - left) / (size * LETTER))];
+    const name = whole.length > letters ? `${whole.slice(0, letters - 1)}…` : whole;
     const half = Math.min((name.length * size * LETTER) / 2, (right - left) / 2);
     const middle = (Math.min(...xs) + Math.max(...xs)) / 2;
     placed.push({ name, size, half, x: Math.min(Math.max(middle, left + half), right - half), y: Math.max(...ys) + size * 0.4 });
