@@ -23,7 +23,7 @@ from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.projections.rebuild import claimed
 from pycrorm_async.store.address import shared_address
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.lake import Lake, LakeEpisode, digest_after
+from pycrorm_async.store.lake import ATTEMPTS, Lake, LakeEpisode, digest_after
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode, RunningDigest, Span, StoredEvent
 
@@ -158,14 +158,10 @@ async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, 
         content = await log.blobs.read_blob(name)
         if content is not None:
             blobs[name] = references[name].media_type, content
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(ATTEMPTS):
         try:
             return lake.add(episodes, declarations, blobs, log.log_id)
         except DatabaseError:
-            if attempt == _ATTEMPTS - 1:
+            if attempt == ATTEMPTS - 1:
                 raise
     return None
-
-
-_ATTEMPTS: Final = 5
-"""Bounds the attempts to commit to the lake while other memories do."""

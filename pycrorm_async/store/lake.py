@@ -57,6 +57,8 @@ _LATER: Final = {"erased"}
 """The tables that lakes made before them lack until a process writes."""
 _ORPHAN_AGE_S: Final = 3600.0
 """Age from which a file that the catalog does not know is not one of an archive that runs: it commits after seconds."""
+ATTEMPTS: Final = 5
+"""Bounds the attempts to make a lake, or to commit to it, while other processes do."""
 _PAGE_EVENTS: Final = 5_000
 _EVENTS_AT_ONCE: Final = 50_000
 """Bounds the events that one query reads, unless an episode has more; each query reads whole groups of rows."""
@@ -91,21 +93,27 @@ def open_lake(address: str, *, write: bool = False) -> Any:
             raise DatabaseUnavailable(f"{address}: the folder cannot be made: {error.strerror}") from error
     elif catalog == "sqlite" and not Path(place).exists():
         raise DatabaseUnavailable(f"{address}: there is no lake: `pycrorm archive --to {address}` makes one")
-    connection = _connect("ducklake", f"{catalog}_scanner")
-    try:
-        options = ["DATA_INLINING_ROW_LIMIT 0", *([f"DATA_PATH '{_quoted(data)}'"] if data else [])]
-        options += [] if write else ["READ_ONLY"]
+    options = ["DATA_INLINING_ROW_LIMIT 0", *([f"DATA_PATH '{_quoted(data)}'"] if data else [])]
+    options += [] if write else ["READ_ONLY"]
+    attach = f"ATTACH 'ducklake:{catalog}:{_quoted(place)}' AS lake ({', '.join(options)}); USE lake"
+    for attempt in range(1, ATTEMPTS + 1):
+        connection = _connect("ducklake", f"{catalog}_scanner")
         if catalog == "sqlite":
             _refuse_other_program(address, Path(place))
-        connection.execute(f"ATTACH 'ducklake:{catalog}:{_quoted(place)}' AS lake ({', '.join(options)}); USE lake")
-        fault = _prepare(connection, write=write)
-    except import_module("duckdb").Error as error:
+        try:
+            connection.execute(attach)
+            fault = _prepare(connection, write=write)
+        except import_module("duckdb").Error as error:
+            connection.close()
+            if not write or attempt == ATTEMPTS:
+                raise unavailable(address, error) from error
+            time.sleep(0.1 * attempt)  # another process may be making the lake
+            continue
+        if fault is None:
+            return connection
         connection.close()
-        raise unavailable(address, error) from error
-    if fault is not None:
-        connection.close()
-        raise DatabaseForeign(f"{shown(address)} {fault}")
-    return connection
+        break
+    raise DatabaseForeign(f"{shown(address)} {fault}")
 
 
 def _parsed(address: str) -> tuple[str, str, str]:
@@ -130,6 +138,7 @@ def _connect(*extensions: str) -> Any:
     except ImportError as error:
         raise MissingExtra(f"a lake needs DuckDB ({error.name}): pip install 'pycrorm-async[lake]'") from None
     connection = duckdb.connect(config={"allow_unsigned_extensions": True, "autoinstall_known_extensions": False})
+    connection.execute("SET enable_progress_bar = false")  # it would be among the rows on stdout, after two seconds
     for wheel in wheels:
         [file] = Path(str(wheel.__file__)).parent.rglob("*.duckdb_extension")
         connection.execute(f"LOAD '{_quoted(str(file))}'")
