@@ -168,22 +168,23 @@ class Reading:
         if self._replica is not None:
             await self._ready()
             async with self._opening:
-                await self._choose_source()
+                self._use(await self._current_log())
 
-    async def _choose_source(self) -> None:
-        replica, primary = self._sources.get(self._replica or self._address), await self._open_primary()
-        if replica is None or replica is primary:
-            return
+    async def _current_log(self) -> EventLog:
+        """Wait until the replica, if it could be opened, shows what has been committed; return the log to read."""
+        primary = (await self._open_primary()).log
+        replica = self._sources[self._replica].log if self._replica in self._sources else primary
+        if replica is primary:
+            return primary
         try:
-            lag = await lag_between(replica.log, primary.log, LAG_S_MAX)
+            lag = await lag_between(replica, primary, LAG_S_MAX)
             state, is_current = str(lag), lag.behind_bytes == 0
         except DatabaseUnavailable as fault:
             state, is_current = f"does not answer: {fault}", False
-        if self._opened is not (replica if is_current else primary).log:
-            _logger.warning(
-                "the replica %s %s; reading from %s", self._replica, state, "it again" if is_current else self._address
-            )
-        self._use((replica if is_current else primary).log)
+        log = replica if is_current else primary
+        if log is not (self._opened or replica):
+            _logger.warning("the replica %s %s; reading from %s", self._replica, state, log.address)
+        return log
 
     async def refresh(self, *, maps: bool = True) -> None:
         """Learn the designator types that were declared since the last call, and map them unless `maps` is false."""
@@ -494,9 +495,8 @@ class Reading:
                     except BaseException:
                         await log.close()
                         raise
-                    self._use(log)
-                    if self._follows and self._replica is not None:
-                        await self._choose_source()
+                    self._source(log)
+                    self._use(await self._current_log() if self._follows and self._replica is not None else log)
 
     def _use(self, log: EventLog) -> None:
         self._sessions = self._source(log).sessions

@@ -24,7 +24,7 @@ from pycrorm_async.store.address import DatabaseAddress, check_replica
 from pycrorm_async.store.log import EventLog
 
 LAG_S_MAX: Final = 5.0
-"""A replica that lacks changes, and whose last change is older than this, is reported."""
+"""A replica that lacks changes, and whose last change is older than this, is reported. A flush waits for it as long."""
 SETTLE_S: Final = 0.2
 """The time in which a replica that is not behind replays what its primary had written."""
 _POLL_S: Final = 0.02
