@@ -92,7 +92,7 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
     return Policy(tuple(leaves), constant_height=constant_height)
 
 
-def learn_polar(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> PolarPolicy:
+def learn_polar(successes: pd.DataFrame, *, min_samples_leaf: int = 20) -> PolarPolicy:
     """Fit a policy over the features "grasp-polar" to successful pick-ups (see `polar_policy`); blocks as `learn`.
 
     It needs fewer successes than `learn`, because both arms and all grasps from the side share theirs, and it sets the

@@ -18,10 +18,11 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import CallerError, NotEnoughExperience, PolicyDamaged, PolicyFileRefused
+from pycrorm_async.errors import CallerError, ImpossibleCondition, NotEnoughExperience, PolicyDamaged, PolicyFileRefused
 from pycrorm_async.learning import (
     Draws,
     Edge,
+    Evidence,
     MoveAndPickUp,
     PickUpChoice,
     PickUpContext,
@@ -31,6 +32,7 @@ from pycrorm_async.learning import (
     SuccessModel,
     context_of,
     default_policy,
+    learn_polar,
     load_policy,
     name_of,
     read_policy,
@@ -162,7 +164,7 @@ def test_probabilities_equal_those_of_scikit_learn_also_where_features_are_missi
     rows = features_of_frame(circumstances)
     varied = [number for number, values in enumerate(rows.T) if len(set(values[~np.isnan(values)])) > 1]
     theirs = ensemble.HistGradientBoostingClassifier(
-        max_iter=len(model.trees), min_samples_leaf=20, early_stopping=False, random_state=0
+        max_iter=len(model.trees), min_samples_leaf=10, early_stopping=False, random_state=0
     )
     with pytest.importorskip("threadpoolctl").threadpool_limits(
         1
@@ -227,7 +229,49 @@ def test_draws_are_confident_uncertain_or_random_and_repeatable() -> None:
     assert rates[Draws.RANDOM] < rates[Draws.UNCERTAIN] < rates[Draws.CONFIDENT]
     far = [PickUpChoice(Arms.LEFT, Grasp.FRONT, -1.5, 0.0, 0.0), PickUpChoice(Arms.LEFT, Grasp.FRONT, -1.5, 0.0, 0.33)]
     assert NEAR_AND_LOW.draw(np.random.default_rng(1), far, PickUpContext(1.0)) == far[1]  # the likeliest of none
+    for draws in Draws:
+        model = NEAR_AND_LOW.drawing(draws)
+        assert model.draw(np.random.default_rng(1), far, PickUpContext(1.0), lambda way: way == far[0]) == far[0]
+        assert model.draw(np.random.default_rng(1), far, PickUpContext(1.0), lambda _: False) in far
     assert len({name_of(NEAR_AND_LOW.drawing(draws)) for draws in Draws}) == 3
+
+
+# --- polar trees ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_polar_tree_sets_the_torso_and_is_read_back_from_its_file(frame: pd.DataFrame, tmp_path: Path) -> None:
+    pytest.importorskip("jpt")
+    successes = frame[frame.status == "SUCCEEDED"]
+    policy = learn_polar(successes)
+    assert policy.coverage(successes) == 1.0
+    save_policy(policy, tmp_path / "policy.json")
+    assert load_policy(tmp_path / "policy.json") == policy
+    done, context = 0, PickUpContext(0.7, torso_limits=TORSO_M)
+    for height in np.random.default_rng(3).uniform(0.6, 1.2, 200).tolist():
+        [choice] = policy.sample(np.random.default_rng(4), 1, PickUpContext(height, torso_limits=TORSO_M))
+        assert choice.torso is not None
+        assert TORSO_M[0] <= choice.torso <= TORSO_M[1]
+        done += succeeds(choice, Pose((1.3, 1.0, height)))
+    assert done > 140  # of the default policy 40
+    one_by_one = np.random.default_rng(5)
+    drawn = policy.sample(np.random.default_rng(5), 20, context)
+    assert [policy.sample(one_by_one, 1, context)[0] for _ in drawn] == drawn
+    assert (policy.likelihood(drawn, context) > 0).all()
+    left_top = Evidence(frozenset({Arms.LEFT}), frozenset({Grasp.TOP}))
+    assert {each[:2] for each in policy.sample(one_by_one, 20, context, left_top)} == {(Arms.LEFT, Grasp.TOP)}
+    with pytest.raises(ImpossibleCondition, match=r"an object 2\.670 to 3\.000 m over the torso"):
+        policy.sample(one_by_one, 1, PickUpContext(3.0, torso_limits=TORSO_M))
+    with pytest.raises(CallerError, match=r"all objects were 0\.900 m over the torso"):
+        learn_polar(successes.assign(height=0.9))
+    with pytest.raises(NotEnoughExperience, match="5 successes are too few"):
+        learn_polar(successes[:5])
+
+
+def test_the_names_and_files_of_trees_of_places_are_those_of_version_1(tmp_path: Path) -> None:
+    save_policy(default_policy(), tmp_path / "policy.json")
+    assert name_of(default_policy()) == "c0792a8bba95"
+    assert (tmp_path / "policy.json").read_bytes().startswith(b'{"format":"pycrorm policy","version":1,"crc32":')
 
 
 # --- files ----------------------------------------------------------------------------------------------------------
