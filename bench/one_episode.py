@@ -1,14 +1,15 @@
-"""Measure what questions about one episode cost in a memory of 50 and of 5,000 episodes, on both databases.
+"""Measure what questions about one episode, recall, and a further batch cost as a memory grows, on both databases.
 
     python -m bench.one_episode                    50 and 5,000 episodes
-    python -m bench.one_episode --episodes 50000   50 and 50,000
+    python -m bench.one_episode --than 2000 --episodes 20000     10^5 and 10^6 events
     python -m bench.one_episode --quick            50 and 200
 
 The memories hold random episodes of some 50 events; the one that is asked about is the same in all of them, and in the
 middle. The sizes take turns, and the least CPU time of the rounds counts. On SQLite it is the CPU time of the process,
 which runs the database. On PostgreSQL it is that of the client, and the server's work is given as the rows that all
-steps of all plans read. `list` is `pycrorm episodes`. The script prints one JSON line: by database, question and size
-the CPU time in ms and the rows read, with the ratio of the largest size to the smallest.
+steps of all plans read. `list` is `pycrorm episodes`, `append` a batch of 100 further episodes. The script prints one
+JSON line: by database, question and size the CPU time in ms and the rows read, with the ratio of the largest size to
+the smallest.
 """
 
 from __future__ import annotations
@@ -34,10 +35,12 @@ from pycrorm_async import Reading
 from pycrorm_async.events.codec import Record
 from pycrorm_async.export.export import export
 from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.named_queries import EpisodeChoice, percepts_of, searches_of
 from pycrorm_async.query.questions import QUESTIONS
+from pycrorm_async.recall.recall import Recall
 from pycrorm_async.report.write import report
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named
@@ -51,6 +54,7 @@ _UNREAD = re.compile("set_config|FOR UPDATE|FOR SHARE")
 """In statements that read none of the rows in question, and that a read-only connection refuses."""
 
 Ask = Callable[[], Awaitable[object]]
+WRITING = ("append", "append and fold")
 
 
 def records_of(numbers: range, asked: int) -> Iterator[Record]:
@@ -67,7 +71,7 @@ async def fill(url: str, episodes: int) -> None:
     """Store and fold so many episodes; the one in the middle is the one to ask about."""
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:
-        projector = Projector(log)
+        projector = Projector(log, installed=own_projections())
         await projector.open()
         await log.append(TYPES)
         for first in range(1, episodes + 1, _AT_ONCE):
@@ -81,6 +85,18 @@ async def fill(url: str, episodes: int) -> None:
 async def questions_of(url: str, number: int, folder: Path) -> AsyncIterator[dict[str, Ask]]:
     """Yield the questions about one episode by name, to an open memory."""
     files = count()
+    writer = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    projector = Projector(writer, installed=own_projections())
+    await projector.open()
+
+    async def append() -> None:
+        first = await writer.last_number() + 1
+        await writer.append([*records_of(range(first, first + _AT_ONCE), 0)])
+
+    async def append_and_fold() -> None:
+        await append()
+        await projector.catch_up()
+
     async with Reading.open(url) as reading:
         log, identity = await reading.log(), (await reading.episode(str(number))).id
 
@@ -125,7 +141,17 @@ async def questions_of(url: str, number: int, folder: Path) -> AsyncIterator[dic
         await questions["copy out"]()
         questions["copy in"] = partial(copied, small, url, "1")
         questions["list"] = lambda: reading.episodes(EpisodeChoice(limit=50))
+        recall = Recall.of(reading)
+        case = next(each for each in await recall(await a_type(reading, number), k=50))
+        questions["recall"] = lambda: recall.like(case)
+        questions |= zip(WRITING, (append, append_and_fold), strict=True)
         yield questions
+    await writer.close()
+
+
+async def a_type(reading: Reading, number: int) -> str:
+    """Return the type of an action of the episode."""
+    return next(each.dtype for each in await reading.tree(number) if each.kind == "action" and each.dtype)
 
 
 async def cpu_s(question: Ask) -> float:
@@ -220,7 +246,7 @@ async def measure(url_of: dict[int, str], rounds: int) -> dict[str, dict[str, An
                 for name, question in questions.items():
                     entry = figures.setdefault(name, {"cpu_ms": {}, "rows": {}})
                     entry["cpu_ms"][size] = round(least[name, size] * 1000, 2)
-                    if url.startswith("postgresql"):
+                    if url.startswith("postgresql") and name not in WRITING:
                         entry["rows"][size] = await rows_read(url, question)
     first, last = min(url_of), max(url_of)
     for each in figures.values():
@@ -231,10 +257,12 @@ async def measure(url_of: dict[int, str], rounds: int) -> dict[str, dict[str, An
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=5_000, help="of the large memory")
+    parser.add_argument("--than", type=int, default=50, help="episodes of the small memory")
+    parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--quick", action="store_true", help="200 episodes and one round, to check that it works")
     options = parser.parse_args()
-    sizes = (50, 200 if options.quick else options.episodes)
+    sizes = (options.than, 200 if options.quick else options.episodes)
     line: dict[str, Any] = {"bench": "one_episode", "episodes": list(sizes)}
     gc.disable()
     with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder) / "server", syncs=False) as server:
@@ -242,7 +270,8 @@ def main() -> None:
             "sqlite": {size: f"sqlite:///{folder}/{size}.db" for size in sizes},
             "postgresql": {size: server.new_database() for size in sizes},
         }
-        for database, url_of in urls.items():
+        for database in options.databases:
+            url_of = urls[database]
             for size, url in url_of.items():
                 asyncio.run(fill(url, size))
                 if database == "postgresql":
