@@ -157,17 +157,16 @@ class ClusterWorkers:
             WorkerLost: a run failed or killed its workers, the scheduler or all workers ended.
             CallerError: the memory cannot be reached from a worker, or a worker has another engine.
         """
-        threads = sum((await self._client.nthreads()).values())
-        whole = list(runs)
-        length = -(-sum(count for _, count in whole) // max(1, _TASKS_PER_THREAD * threads))
+        tally, alone_s, whole = Tally(), 0.0, list(runs)
         job_at = job, engine_class().__name__, self._destination if job.recorded else None
-        futures = [
-            self._client.submit(_perform, *job_at, first, count, pure=False)
-            for first, count in _divided(whole, max(length, _ROLLOUTS_PER_TASK_MIN))
-        ]
-        working = {asyncio.create_task(self._result(each), name="pycrorm rollouts") for each in futures}
-        tally, alone_s = Tally(), 0.0
+        futures: list[Future] = []
+        working: set[asyncio.Task[Tally]] = set()
         try:
+            threads = sum((await self._client.nthreads()).values())
+            length = -(-sum(count for _, count in whole) // max(1, _TASKS_PER_THREAD * threads))
+            for first, count in _divided(whole, max(length, _ROLLOUTS_PER_TASK_MIN)):
+                futures.append(self._client.submit(_perform, *job_at, first, count, pure=False))
+            working |= {asyncio.create_task(self._result(each), name="pycrorm rollouts") for each in futures}
             while working:
                 done, _ = await asyncio.wait(
                     [*working, *self._daemon], timeout=_CONNECT_S, return_when=asyncio.FIRST_COMPLETED

@@ -121,16 +121,23 @@ async def test_a_cluster_without_scheduler_workers_or_this_version_is_refused(mo
 
 
 @pytest.mark.soak
-async def test_a_scheduler_that_ends_is_one_line_and_finished_rollouts_are_kept(tmp_path: Path) -> None:
+async def test_a_scheduler_or_workers_that_end_are_one_line_and_finished_rollouts_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     await recover(place.url)
-    async with started(1) as one:
-
-        def end() -> None:
-            one.loop.add_callback(one.scheduler.close)
-
-        async with ClusterWorkers(one.scheduler_address, place) as workers:
-            with pytest.raises(WorkerLost, match=r"the scheduler at tcp.* has ended; finished rollouts are recorded"):
-                await workers.roll_out(JOB, [(0, 500), (500, 500)], once(end))
+    async with started(1) as one, ClusterWorkers(one.scheduler_address, place) as workers:
+        with pytest.raises(WorkerLost, match=r"the scheduler at tcp.* has ended; finished rollouts are recorded"):
+            await workers.roll_out(
+                JOB, [(0, 500), (500, 500)], once(lambda: one.loop.add_callback(one.scheduler.close))
+            )
+        with pytest.raises(WorkerLost, match=r"the scheduler at tcp.* finished rollouts are recorded"):
+            await workers.roll_out(JOB, [(0, 500)])
     async with Reading.open(place.url) as reading:
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 1000)) >= 125
+    monkeypatch.setattr(cluster, "_ALONE_S", 1.0)
+    async with started(1) as one, ClusterWorkers(one.scheduler_address, None) as workers:
+        monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+        unrecorded = RolloutTask(JOB.scene, JOB.policy, JOB.seed, recorded=False)
+        with pytest.raises(WorkerLost, match=r"the cluster has had no workers for 1 s; finished rollouts"):
+            await workers.roll_out(unrecorded, [(0, 1000)], once(lambda: one.scale(0)))
