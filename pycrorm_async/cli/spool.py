@@ -27,7 +27,7 @@ from pycrorm_async.queue.spool import folder_error
 from pycrorm_async.settings import Settings
 
 FolderArgument = Annotated[
-    Path | None, typer.Argument(metavar="DIR", help="The spool; default: that of --spool, or the one of --url.")
+    Path | None, typer.Argument(metavar="DIR", help="Folder of the spool; default: --spool, or the spool of --url.")
 ]
 
 
@@ -58,10 +58,10 @@ def inspect(*, folder: FolderArgument = None, place: Place, as_json: output.Json
 
 
 def repair(*, folder: FolderArgument = None, place: Place, as_json: output.JsonOption = False) -> int:
-    """Repair damaged folders of dead recorders, so that their readable records can be stored.
+    """Repair damaged folders of dead recorders, so that the records that are kept can be stored.
 
-    The original of a repaired folder is kept beside it under the name that is printed. Exit code 1 if records could
-    not be kept, 3 if a damaged folder cannot be repaired.
+    Does not keep unreadable records, nor later ones of the same episode. Prints the folder that has the originals. Exit
+    code 1 if a record is not kept, 3 if a damaged folder cannot be repaired.
     """
     spool = _spool_folder(folder, place)
     maintenance.inspect_spool(spool)
@@ -131,7 +131,7 @@ def _print(report: maintenance.SpoolReport) -> None:
             "log": report.log_id or "none: no writer has drained the spool yet",
             "recorders": str(len(report.recorders)),
             "originals of repaired folders": ", ".join(report.set_aside),
-            "incomplete": ", ".join(report.unfinished),
+            "incomplete folders": ", ".join(report.unfinished),
         },
     )
     if report.recorders:
@@ -188,7 +188,7 @@ def _print_repair(report: maintenance.RepairReport) -> None:
             f" are missing ({_spans('position', each.positions)} in the original folder); the episode is {kept}"
         )
     if report.headless:
-        output.print_line("  not kept: the ends of episodes that were open in the oldest file and have no later record")
+        output.print_line("  not kept: the oldest file's list of open episodes; one without a later record gets no end")
 
 
 def _state(each: maintenance.RecorderReport) -> str:

@@ -2,14 +2,15 @@
 
 It observes PyCRAM from outside. PyCRAM's callbacks of plans report actions, motions and code; replaced methods report
 what has no callback: actions that another action performs, expressions of the language, branches in threads, plans in
-the prospection world, and changes of a Bullet world. Leaving the block removes all of them.
+the prospection world, and changes of a Bullet world. All of them act only inside the block.
 
 Theory of operation. Each thread has a stack of the nodes that run in it, because PyCRAM has one current node for all
 threads and so loses nodes of parallel branches or assigns wrong parents. The stack of a branch begins with the
-parallel node; that of a thread that the plan starts itself is empty, so its first node is a child of the root. PyCRAM
-has two nodes for an action, a description and what it resolves to; only the latter is recorded, unless the description
-fails before it is resolved. The first node in the prospection world opens a simulated episode, which ends with PyCRAM's
-`with` block; objects have their real keys in it. An exception of this package is counted and does not reach the plan.
+parallel node. That of a thread that the plan starts itself begins empty, so its first node is a child of the root.
+PyCRAM has two nodes for an action: a description, and the resolved action. Only the resolved action is recorded, or the
+description if it fails before. The first node in the prospection world opens a simulated episode, which ends with
+PyCRAM's `with` block; in it, the copy of an object has the key of the original. An exception of this package's hooks is
+counted and does not reach the plan.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class _Observer(Protocol):
 
 
 class Seams:
-    """The methods replaced and the callbacks added since `is_on` was set; `remove` removes all of them.
+    """Replaces methods by seams, which act only while `is_on`, and adds callbacks; `remove` removes both.
 
     A method that another library has replaced in turn is not restored; the seam inside it then only calls the original.
     """
@@ -55,7 +56,7 @@ class Seams:
         self._undo = ExitStack()
 
     def remove(self) -> None:
-        """Remove all seams; those that still run in other threads do nothing from now on."""
+        """Remove all seams; calls of them that other threads have begun record nothing from now on."""
         self.is_on = False
         self._undo.close()
 
@@ -76,7 +77,7 @@ class Seams:
         self._replace(owner, name, seam)
 
     def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
-        """Call `report(subject, *args)` after a method; named arguments are passed by position where they have one."""
+        """Call `report(subject, *args)` after a method has returned; named arguments are passed as in `around`."""
         original = vars(owner)[name]
         parameters = signature(original)
 
@@ -124,7 +125,7 @@ def _without_fault(remove: Callable[[Any], None], callback: Callable[..., Any]) 
 
 
 def guarded(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Count the exceptions of an observer's method, so that none reaches the plan; do nothing without the seams."""
+    """Count the exceptions of an observer's method, so that none reaches the plan; skip it unless the seams are on."""
 
     @wraps(method)
     def call(self: _Observer, *args: Any, **kwargs: Any) -> Any:
@@ -144,7 +145,7 @@ KNOWN_VERSIONS: Final = ("1.0.4",)
 _PYCRAM: Final = ForeignPackage("PyCRAM", extra="pycram", versions=KNOWN_VERSIONS)
 _SETTINGS: Final = Settings(fold="at_end", sync_interval_ms=250)
 _ACTIVE: Final[dict[int, object]] = {}
-"""The active `remember` by process id: it replaces methods of the whole process; a forked child may have its own."""
+"""The active `remember` by process id: only one, because it replaces methods; a forked child may have its own."""
 
 
 @contextmanager
@@ -163,7 +164,7 @@ def remember(
     """Record the PyCRAM plans that any thread performs in this block, as one episode of the memory at this URL.
 
     The arguments are those of `Memory.open` and `Memory.episode`. By default the tables are made when the block ends,
-    and events are synced every 250 ms instead of 50, which a power loss can take: both leave more time to the plan.
+    and events are synced every 250 ms instead of 50, so a power loss can take more. Both leave the plan more time.
 
     Raises:
         MissingExtra: PyCRAM is not installed.
@@ -172,7 +173,7 @@ def remember(
     """
     _PYCRAM.check_version(_PYCRAM.installed_version("pycram-robotics"))
     process, this = os.getpid(), object()
-    try:  # before `this` becomes the active one, because Ctrl-C may come directly after that
+    try:  # begins before `this` becomes active, because Ctrl-C may come directly after that
         if _ACTIVE.setdefault(process, this) is not this:
             raise CallerError("another `remember` is active in this process: leave its block, or perform inside it")
         labels = {"description": description, "plan": plan, "seed": seed, "tags": tags, "metadata": metadata}
@@ -204,7 +205,7 @@ class _PyCRAMPlans:
     def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
         """Record an episode until the block ends."""
         world = self._pycram.World.current_world
-        failure: BaseException | None = None  # not `sys.exception()`, which has one also if the block is in an `except`
+        failure: BaseException | None = None  # not `sys.exception()`: a block inside an `except` has that one
         with self._episodes.open(world, **labels) as episode:
             self._episodes.real, self.seams.is_on = episode, True
             try:
@@ -289,7 +290,8 @@ class _PyCRAMPlans:
             fields, bases = self._values.field_types(type_, values), self._bases(type_)
             declared = self._types[type_] = self.seams.recording.type(node.kind, _dtype(type_), fields, bases=bases)
         episode = node.episode
-        # Asking Bullet for pose and torso takes as long as recording the event, so it is done where they may differ.
+        # Asking Bullet for pose and torso takes as long as recording the event. In the real world motions never ask,
+        # and other nodes only after a movement that no seam saw.
         is_recorded = episode is self._episodes.real and (self._world.is_followed or node.kind == "motion")
         robot = self._values.robot_key() if is_recorded else self._values.robot(episode)
         node.key = episode.start(next(self._keys), declared, values, parent=self._episodes.cause(episode), robot=robot)
@@ -300,14 +302,14 @@ class _PyCRAMPlans:
         return "motion" if issubclass(designator, self._pycram.BaseMotion) else "language"
 
     def _bases(self, designator: type) -> list[str]:
-        """Return the dtypes of the actions that an action descends from, nearest first; none for another type."""
+        """Return the dtypes of the actions that an action descends from, nearest first; for other designators, none."""
         base = self._pycram.ActionDescription
         return [each.__name__ for each in designator.__mro__[1:] if issubclass(each, base) and each is not base]
 
     def _end(
         self, node: RunningNode, status: NodeStatus, failure: BaseException | None = None, result: Any = None
     ) -> None:
-        """End a node, and those inside it whose end PyCRAM did not report; a failure's class decides the status."""
+        """End a node, and those inside it whose end PyCRAM did not report; a failure's class replaces `status`."""
         self._world.flush()
         nodes = self._thread.nodes
         by_failure: NodeStatus | None = "CANCELLED" if self._episodes.is_interruption(failure) else None
@@ -340,7 +342,7 @@ class _PyCRAMPlans:
     def _nested_action(self, call: Callable[[], Any], action: Any) -> Any:
         nodes = self._thread.nodes
         if nodes and getattr(nodes[-1].of, "designator_ref", None) is action:
-            return call()  # of the node that has just started
+            return call()  # recorded: the node that has just started is this action's
         return self._performed(call, action, "action")
 
     def _performed(self, call: Callable[[], Any], designator: Any, kind: RecordedKind = "language") -> Any:
@@ -348,7 +350,7 @@ class _PyCRAMPlans:
         if node is None:
             return call()
         self._parallel[id(designator)] = node
-        before = getattr(designator, "reason", None)  # PyCRAM keeps the outcome of an earlier call
+        before = getattr(designator, "reason", None)  # PyCRAM keeps the reason of an earlier call
         try:
             result = call()
         except BaseException as failure:
@@ -413,7 +415,7 @@ class PyCRAMWorld:
     """Observes the worlds of this process.
 
     Attributes:
-        is_followed: whether all that has moved was seen; False once physics or a restored state may have moved more.
+        is_followed: whether seams saw each movement; False once physics or a restored state may have moved an object.
     """
 
     def __init__(self, seams: Seams, values: PyCRAMValues, episodes: PyCRAMEpisodes) -> None:
@@ -423,7 +425,7 @@ class PyCRAMWorld:
         self.is_followed = True
 
     def connect(self) -> None:
-        """Add the seams."""
+        """Replace the methods that change a world."""
         used = self._values.pycram
         self.seams.after(used.World, "add_object", self._object_added)
         self.seams.around(used.World, "remove_object", self._remove_object)
@@ -442,7 +444,7 @@ class PyCRAMWorld:
             episode.object_added(self._values.key(added), **self._values.description(added), node=cause)
 
     def _remove_object(self, call: Callable[[], Any], world: Any, *removed: Any, **_: Any) -> Any:
-        key = self._key(*removed)  # the prospection world forgets what it is a copy of
+        key = self._key(*removed)  # first: the prospection world then forgets whose copy it is
         result = call()
         self._object_removed(world, key)
         return result
@@ -467,7 +469,7 @@ class PyCRAMWorld:
     def _joint_moved(self, world: Any, joint: Any, position: float) -> None:
         thread, owner = self._episodes.thread, joint.object
         change = thread.changes.get(id(owner))
-        if change is None:  # for the first of up to fourteen joints
+        if change is None:  # only for the first joint that this motion sets
             if self._episodes.of(world) is None:
                 return
             change = self._change(owner)
@@ -528,7 +530,7 @@ class PyCRAMWorld:
             self.flush()
 
     def flush(self) -> None:
-        """Record the changes of the world by this thread."""
+        """Record the changes that this thread has made to the world since the last flush."""
         thread = self._episodes.thread
         if not thread.changes:
             return

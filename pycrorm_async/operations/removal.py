@@ -2,16 +2,18 @@
 
 Theory of operation. One transaction deletes the events of some episodes from the log, with their digests and blobs,
 and the rows made from them, in every generation and of every projection, and writes a row of `pycrorm_removed_episode`
-for each. From then on an append discards what arrives of them (`store.append`), so that spools, copies and imports
-cannot bring them back. The transaction raises the revision of every generation: a process that has folded an event of
-them before rolls its batch back (`projections.generations`). The database refuses the deletion outside of such a
-transaction, and on PostgreSQL to all but the owner of the log.
+for each. From then on an append discards the events of these episodes (`store.append`), so that spools, copies and
+imports cannot bring them back. The transaction raises the revision of every generation, so that a process that has
+folded such an event, and not written its rows yet, rolls that batch back (`projections.generations`). The database
+refuses the deletion outside of such a transaction, and on PostgreSQL to all logins but the owner of the log.
 
-What is outside of the database follows: segments that the spool keeps, pages of the file, the lake. The row says when
-nothing was left (`finished_wall_ns`); until then the same command continues, also after a kill at any step.
+A lake is erased before this transaction, because the transaction overwrites the row that names the lake. After it
+follow the pages of the file and the segments that the spool keeps. The row says when nothing was left
+(`finished_wall_ns`); until then the same command continues, also after a kill at any step. A lake in which files were
+left is visited again only if `--lake` names it.
 
 On PostgreSQL the tables may belong to another role, whose code must not run with the rights of the owner. The owner
-then removes the events alone, and the same command, run by a login of that role, the rows of the tables.
+then removes only the events; the same command, run by a login of that role, removes the rows of the tables.
 """
 
 from __future__ import annotations
@@ -40,9 +42,9 @@ from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
 
 EVENTS_AT_ONCE: Final = 10_000
-"""Bounds the events of one transaction, unless an episode has more, and so the time that others wait to write."""
+"""Bounds the events that one transaction deletes, unless one episode has more, and so the wait of other writers."""
 _ROW_KEYS: Final = ("id", "resolution_id", "node_id")
-"""The names of the column with the row id that begins the key of a table, the first that a table has."""
+"""Possible names of the column with row ids, which begins a table's key; the first that the table has counts."""
 _BLOB_EVENTS = "SELECT type, payload FROM event WHERE payload LIKE '%\"$blob\"%' AND episode IN "
 _REFERRED = text("SELECT 1 FROM event WHERE payload LIKE :pattern LIMIT 1")
 _REFERRED_BY_TYPE = text("SELECT 1 FROM pycrorm_declaration WHERE payload LIKE :pattern LIMIT 1")
@@ -50,7 +52,7 @@ _DELETE_BLOB = text("DELETE FROM pycrorm_blob WHERE hash = :hash")
 
 
 class ErasedEpisode(NamedTuple):
-    """The erasure of one episode. `left` names what still holds parts of it, with the next step; empty if nothing."""
+    """The erasure of one episode. `left` names each place that still holds parts of it, with the next step."""
 
     removed: RemovedEpisode
     left: tuple[str, ...]
@@ -59,9 +61,9 @@ class ErasedEpisode(NamedTuple):
 async def erasable(
     log: EventLog, names: Sequence[str], *, ended_before: datetime | None = None, tags: Collection[str] = ()
 ) -> list[EpisodeRow | RemovedEpisode]:
-    """Return the named episodes, or those that ended before this time and have all these tags.
+    """Return the named episodes; with `ended_before`, instead those that ended before it and have all these tags.
 
-    A name may be that of an episode whose erasure was interrupted. Raises `CallerError` for one that runs.
+    A name may be that of an erased or archived episode. Raises `CallerError` for one that runs, and `UnknownEpisode`.
     """
     removed = {key: each for each in await log.all_removed() for key in (str(each.number), each.id)}
     if ended_before is None:
@@ -89,9 +91,9 @@ async def erase(
     spool: Path,
     lake: str | None = None,
 ) -> list[ErasedEpisode]:
-    """Erase these episodes, or finish their erasure, also in this lake, and in that to which one was archived.
+    """Erase these episodes, or finish their erasure, also in `lake` and in each lake to which one was archived.
 
-    Raises `CallerError` for one that runs, `MissingExtra` for a lake without the package.
+    Raises `CallerError` for one that runs, and `MissingExtra` for a lake if the extra `[lake]` is not installed.
     """
     lakes: dict[str, list[str]] = {} if lake is None else {lake: [each.id for each in rows]}
     archived = [each for each in rows if isinstance(each, RemovedEpisode) and each.archived_in is not None]
@@ -99,7 +101,7 @@ async def erase(
         lakes.setdefault(each.archived_in or "", []).append(each.id)
     left: list[str] = []
     for address, ids in lakes.items():
-        again = f"of an archive that runs or was killed: run it again in an hour, with --lake {address}"
+        again = f"of an archive that runs or was killed: run `pycrorm erase` in an hour, with --lake {address}"
         left += [f"{each}, {again}" for each in erase_in_lake(address, ids)]
     if archived:
         async with log.writing() as connection:
@@ -115,7 +117,7 @@ async def erase(
     numbers = [each.number for each in rows]
     tables = await _remove_rows(log, numbers, left)
     if fault := await dialect_of(log.engine).purge(log.engine, tables):
-        left.append(f"{fault}: run it again when that has ended")
+        left.append(f"{fault}: run the command again when that process has ended")
     identities = {parse_episode_id(each.id): each for each in rows}
     held = forget_stored(spool, identities)
     now = {each.number: each for each in await log.all_removed()}
@@ -134,7 +136,7 @@ async def erase(
 
 
 def parts(rows: Sequence[EpisodeRow], events_max: int) -> Iterator[list[EpisodeRow]]:
-    """Yield the episodes in parts of at most so many events; one that has more is a part of its own."""
+    """Yield the episodes in parts of at most `events_max` events; an episode with more is a part of its own."""
     part: list[EpisodeRow] = []
     events = 0
     for row in rows:
@@ -157,8 +159,8 @@ async def remove(
 ) -> list[RemovedEpisode]:
     """Remove these episodes from log and tables, in one transaction; return those removed.
 
-    An episode to archive that was changed since its row was read stays. Raises `CallerError` for one that runs, and for
-    one to archive `TablesForeign` where this login may not use the tables.
+    With `archived_in`, an episode that got events since its row was read stays. If this login may not use the tables,
+    raises `TablesForeign` with `archived_in`, else leaves their rows. Raises `CallerError` for an episode that runs.
     """
     now_ns = SYSTEM_CLOCK.wall_ns()
     if digests is None:
@@ -218,7 +220,7 @@ async def _delete_events(connection: AsyncConnection, numbers: Sequence[int]) ->
 
 
 async def _remove_rows(log: EventLog, numbers: Sequence[int], left: list[str]) -> Sequence[str]:
-    """Delete the rows of removed episodes that the tables may still have; return the tables."""
+    """Delete the rows that tables still have of these episodes; return the tables. Note foreign tables in `left`."""
     try:
         with log.translated():
             async with log.writing() as connection:
@@ -226,13 +228,13 @@ async def _remove_rows(log: EventLog, numbers: Sequence[int], left: list[str]) -
                 tables = await _lock_tables(connection)
                 await _delete_rows(connection, tables, numbers)
     except TablesForeign as fault:
-        left.append(f"the tables: {fault}; then run it again with that login")
+        left.append(f"the tables: {fault}; run the command again with the login that folds")
         return []
     return list(tables)
 
 
 async def _lock_tables(connection: AsyncConnection) -> dict[str, set[str]]:
-    """Return the columns of all made tables, by name; roll back every batch that other processes have folded."""
+    """Return the columns of all made tables, by name; make other processes roll back folded batches not yet written."""
     dialect = dialect_of(connection)
     if not await dialect.has_table(connection, "pycrorm_generation", to_change=True):
         return {}
@@ -250,7 +252,7 @@ async def _delete_rows(connection: AsyncConnection, tables: Mapping[str, set[str
         if is_keyed or EPISODE in columns:
             key = "id" if is_keyed else EPISODE
             row = None if is_keyed else next((each for each in _ROW_KEYS if each in columns), None)
-            # Not every table has an index on the episode; each has one on the row ids, which the fold makes of it.
+            # Not every table has an index on the episode; each has one on row ids, which begin with the episode number.
             within = f" AND {row} >= {lowest} AND {row} < {end}" if row else ""
             await connection.exec_driver_sql(f'DELETE FROM "{name}" WHERE {key} IN {_list(numbers)}{within}')  # noqa: S608
         if f"{OWN}{BLOCKS}__" in name:

@@ -22,20 +22,19 @@ Convert: TypeAlias = Callable[[Any], Any]
 
 # === checked arguments ========================================================================================
 #
-# Copy the arguments of an executive, because a value of a wrong type in the log would stop the fold of its episode.
+# Copy and check the arguments of an executive, because a value of a wrong type in the log would park its episode.
 #
-# A wrong value raises `CallerError` if it is required (a pose); an optional one (a colour, one joint) is counted as
-# missing.
+# A wrong pose or struct raises `CallerError`; another wrong value (a colour, one joint) is counted as missing.
 
 _INTEGERS = range(-(2**63), 2**63)
 _UNIT_TOLERANCE = 1e-6
-"""A quaternion whose length differs from 1 by less keeps its bits: it is that of an executive in single precision."""
+"""A quaternion whose length differs from 1 by less stays unchanged, because single precision rounds by that much."""
 
 S = TypeVar("S", bound=msgspec.Struct)
 
 
 def struct_of(value: object, kind: type[S]) -> S:
-    """Return a value of this class whose parts, or numbers of numpy, have the declared types. Raises `CallerError`."""
+    """Copy a struct of this class and check its parts; numbers of numpy become Python's. Raises `CallerError`."""
     if not isinstance(value, kind):
         raise CallerError(f"expected a {kind.__name__}, got {values.clean_repr(value)}")
     try:
@@ -46,7 +45,7 @@ def struct_of(value: object, kind: type[S]) -> S:
 
 
 def _with_unit_turn(value: S) -> S:
-    """Return a pose, or a value with a pose, with a quaternion of length 1, from which a rotation is computed."""
+    """Return a pose, or a value with one, whose quaternion is scaled to length 1; one of length 0, inf or nan stays."""
     if isinstance(value, event_types.PoseValue):
         length = math.hypot(*value.orientation)
         if 0 < length < math.inf and abs(length - 1) > _UNIT_TOLERANCE:
@@ -57,7 +56,7 @@ def _with_unit_turn(value: S) -> S:
 
 
 def pose_of(pose: values.PoseLike | event_types.PoseValue) -> event_types.PoseValue:
-    """Copy a pose. Raises `CallerError`, also for a number that is not finite."""
+    """Copy a pose. Raises `CallerError` for a wrong part, a number that is not finite, or a time beyond 64 bits."""
     value = (
         struct_of(pose, event_types.PoseValue)
         if values.recorded_as(type(pose)) is None
@@ -71,7 +70,7 @@ def pose_of(pose: values.PoseLike | event_types.PoseValue) -> event_types.PoseVa
 
 
 def _are_plain(joints: dict[Any, Any]) -> bool:
-    """Return whether all names are ASCII texts and all positions finite floats, so that none of them must change."""
+    """Return whether all names are ASCII texts and all positions finite floats, which can be recorded as they are."""
     if set(map(type, joints)) != {str} or set(map(type, joints.values())) != {float}:
         return False
     names = "".join(joints)
@@ -79,7 +78,7 @@ def _are_plain(joints: dict[Any, Any]) -> bool:
 
 
 class ArgumentReader:
-    """Copies the arguments that describe an object; counts the ones that it has to leave out in `missing`."""
+    """Copies the arguments that describe an object; counts wrong ones in the emitter's `missing`."""
 
     def __init__(self, emitter: Emitter) -> None:
         self._emitter = emitter
@@ -93,7 +92,7 @@ class ArgumentReader:
         joints: Mapping[str, float],
         **others: Any,
     ) -> RecordedObject:
-        """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
+        """Copy the description of an object; `others` are all other attributes of `RecordedObject`."""
         kind, urdf = self.text_of("object_type", object_type) or "UNKNOWN", None
         mass_kg = self._number_of("mass_kg", others["mass_kg"])
         if others["urdf"] is not None:
@@ -113,7 +112,7 @@ class ArgumentReader:
         )
 
     def text_of(self, argument: str, text: object) -> str | None:
-        """Copy a text; of an enum its member's name, of another value its shortened repr."""
+        """Copy a text. Return an enum member's name; count another value as missing, and return its shortened repr."""
         if text is None:
             return None
         if isinstance(text, Enum):
@@ -124,7 +123,7 @@ class ArgumentReader:
         return values.clean_repr(text)
 
     def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
-        """Copy joint positions; those that are not finite numbers are counted as missing."""
+        """Copy joint positions. Leave out those that are not finite numbers, and count them as missing, except None."""
         if not isinstance(joints, Mapping):
             self._missing.note(
                 "JointsMoved", "joints", f"they must be positions by name, not {values.clean_repr(joints)}"
@@ -225,7 +224,7 @@ class RecordedValues:
         return self._checked(value) if isinstance(value, msgspec.Struct) else value
 
     def failure(self, failure: object, references: values.References) -> event_types.FailureValue:
-        """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
+        """Copy a `FailureCause`; `end_node` replaces the type `UNNAMED` of a text. Raises `CallerError` for others."""
         match failure:
             case BaseException():
                 return self._failures.copy(failure, references, self.converted)
@@ -235,7 +234,7 @@ class RecordedValues:
         return struct_of(failure, event_types.FailureValue)
 
     def _checked(self, value: msgspec.Struct) -> Any:
-        """Return a value of an event if it is whole, and its rows are those of this episode."""
+        """Return a checked copy; a `RefusedValue` if a part is wrong, or it refers to a row that the episode lacks."""
         try:
             if isinstance(value, event_types.PoseValue):
                 return pose_of(value)
@@ -252,5 +251,5 @@ class RecordedValues:
     def _known_object(self, value: Any) -> event_types.ObjectReference | None:
         try:
             return self._objects.reference(value)
-        except Exception:  # noqa: BLE001  it is not hashable, so it is no key
+        except Exception:  # noqa: BLE001  a value that cannot be hashed is no key
             return None

@@ -24,7 +24,7 @@ from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.values import clean, clean_repr
 
 _TYPES_MAX = 10_000
-"""Bounds the types kept for reuse; when it is reached all are dropped."""
+"""Bounds the declared types kept for reuse, which are all dropped then, and the types prepared in advance."""
 
 
 _Arguments: TypeAlias = tuple[
@@ -34,7 +34,7 @@ _Arguments: TypeAlias = tuple[
 
 
 class Recording:
-    """Writes the episodes of any executive; `Memory.recording` and `SyncMemory.recording`.
+    """Writes the episodes of any executive; it is `Memory.recording` and `SyncMemory.recording`.
 
     The hooks of our own plan layer (`plan_recorder`) open their episodes and declare their types here too.
 
@@ -47,7 +47,7 @@ class Recording:
         known_types: the types that this memory has declared so far, shared with the recorder of our own plans.
         stored: the declarations that the database holds already, also from other processes.
         software, provenance: recorded with each episode.
-        stored_episodes: the episodes of the log, to continue one that has an id of its own.
+        stored_episodes: the episodes of the log, to continue the one that has the `id` given to `episode`.
     """
 
     def __init__(
@@ -86,14 +86,14 @@ class Recording:
     ) -> declarations.DeclaredType:
         """Declare a type of node once, and return it; the same arguments return the same type.
 
-        A part that cannot be declared is counted as missing, with the reason, and never raises. A field that
-        contradicts a built-in type or an earlier declaration of this dtype is kept under `<field>_<type>`, and one with
-        a reserved name, such as `kind`, under `kind_`. A type whose name cannot be a table's gets a similar one; the
-        nodes of a type that still cannot have a table are recorded without a type.
+        Raises nothing: a part that cannot be declared is counted as missing, with the reason. A field that contradicts
+        a built-in type or an earlier declaration of this dtype is kept under `<field>_<type>`, and one with a reserved
+        name, such as `kind`, under `kind_`. A type whose name cannot name a table gets a similar name; the nodes of a
+        type that still cannot have a table are recorded without a type.
 
         Args:
             kind: an `action`; a `motion`, which moves the robot itself; `language`, which controls other nodes.
-            dtype: a name as of a class. With the dtype of a built-in type (`PickUpAction`), nodes are in its table.
+            dtype: a name as of a class. That of a built-in type (`PickUpAction`) puts the nodes into its table.
             fields: their types by name: `integer`, `real`, `text`, `boolean`, `datetime`, `enum`, `pose`, `object`,
                 `("list", "real")`, `("dict", "text")`, or a Python type of these (`float`, `list[str]`, `Pose`).
             bases: dtypes of more general types, nearest first.
@@ -103,7 +103,7 @@ class Recording:
         try:
             cached = _arguments(kind, dtype, fields, bases, concept, aliases)
             declared = self._types.get(cached)
-            if declared is None and not self.emitter.is_closed:  # before the lock, which may be held since a fork
+            if declared is None and not self.emitter.is_closed:  # first: a fork may leave the lock held
                 with self._lock:
                     if len(self._types) >= _TYPES_MAX:
                         self._types.clear()
@@ -117,14 +117,14 @@ class Recording:
     def prepare(
         self, kind: RecordedKind, dtype: str, fields: Mapping[str, declarations.FieldSpec], *, bases: Sequence[str] = ()
     ) -> None:
-        """Derive a type ahead, so that `type` with the same arguments only has to write it, in a third of the time.
+        """Derive a type in advance: `type` with the same arguments then only writes it, in a third of the time.
 
         Nothing is declared, so a type that is never asked for has no table and reserves no name. Raises nothing.
         """
         try:
             table = self.known_types.table_of(dtype)
             declared = declarations.declare_named(kind, dtype, fields, self.known_types.copy_of(table), bases=bases)
-            # One with another name depends on other tables than its own.
+            # A renamed type is not kept: its name depends on further tables, whose changes `state` does not show.
             if declared.dtype is None and declared.type.payload and len(self._prepared) < _TYPES_MAX:
                 state = self.known_types.state_of(table)
                 self._prepared[_arguments(kind, dtype, fields, bases)] = declared, state
@@ -180,8 +180,8 @@ class Recording:
         """Start an episode; use it with `with`, or call its `close`. Any number may be open at a time.
 
         An episode with an `id` is recorded once. If the log has it with its end, nothing is recorded, and `is_recorded`
-        is true. One with a name that the process before could not finish is continued: report all of it again in the
-        same order, and only what is not stored yet is written.
+        is true. A named one that an earlier process left without an end is continued: report all of it again in the
+        same order; only events that are not stored yet are written.
 
         >>> with recording.episode(id="kitchen/2019-05-01.bag", at=1_556_700_000_000_000_000) as episode:
         ...     episode.start("a", navigate, at=1_556_700_001_500_000_000)
@@ -194,16 +194,18 @@ class Recording:
             convert: converts each parameter, result and observed value, and each item of one, to a scalar, a text, a
                 list or dict, a `PoseValue`, an `ObjectReference`, or, for a field of the type `object`, the key of an
                 object. An exception that it raises is recorded as the reason why the value is missing.
-            failures: the classes of the executive's own plan failures: nodes and episodes that one left are FAILED, and
-                those that another exception left are CANCELLED or ERROR.
-            id: a UUID, which is the id of the episode; or a name that only this episode has, of which its id is made
-                (UUIDv5). Blocks until all that was recorded before is stored, and the log has been read. Until a named
+            failures: the classes of the executive's own plan failures. Nodes and episodes that one left are FAILED;
+                after a cancellation or Ctrl-C nodes are CANCELLED and episodes INTERRUPTED; after another exception
+                both are ERROR.
+            id: the UUID of the episode; or a name that no other episode has, from which the UUID is computed (UUIDv5).
+                The call then blocks until all earlier records are stored and the log has been read. Until a named
                 episode has an end it counts as RUNNING, also after its process died.
-            at: when it started, if not now; see `event_times.At`. All events of the episode then need an `at` too.
+            at: when it started, if not now; see `event_times.At`. An event without an `at` then has the time of the
+                event before it.
             created_by: who recorded it; by default the user of this process.
 
         Raises:
-            CallerError: an argument has the wrong type. Any other fault is counted, and the episode stays empty.
+            CallerError: an argument has a wrong type or value. Any other fault is counted, and the episode stays empty.
         """
         text = description or plan or "an episode"
         unchecked: tuple[object, object, object] = (simulated, seed, failures)  # as the caller passed them
@@ -248,7 +250,7 @@ class Recording:
         thought_by: NodeReference | None = None,
         strict: bool = False,
     ) -> openings.EpisodeOpening:
-        """Check the arguments of an episode. With `strict`, a text that is too long is refused, and not cut.
+        """Check the arguments of an episode. A plan or description that is too long is cut later; `strict` refuses it.
 
         Raises `CallerError`.
         """
@@ -261,7 +263,7 @@ class Recording:
         )
 
     def note_fault(self, where: str, error: BaseException) -> None:
-        """Count a fault of an integration in `Memory.status`, and log it now and then. Raises nothing."""
+        """Count a fault of an integration in `Memory.status`; log the 1st, 2nd, 4th, 8th and so on. Raises nothing."""
         self.emitter.note_fault(where, error)
 
 
@@ -278,7 +280,7 @@ def _arguments(
 
 def _identity(id: object) -> EpisodeId:  # noqa: A002  the argument's name
     if not isinstance(id, str | UUID) or not id or (isinstance(id, str) and clean(id) != id):
-        raise CallerError(f"the id of an episode must be a UUID, or a name that is not empty, not {id!r:.100}")
+        raise CallerError(f"the id of an episode must be a UUID or non-empty UTF-8 text without NUL, not {id!r:.100}")
     return named_episode_id(id)
 
 
@@ -291,7 +293,7 @@ def _is_whole(reference: Any) -> bool:
 
 
 def _undeclared(kind: object, dtype: object) -> declarations.DeclaredType:
-    """Return the type of nodes whose type cannot be declared."""
+    """Return a type without a table, for nodes whose own type cannot be declared."""
     valid: RecordedKind = "action"
     if isinstance(kind, str) and kind in get_args(RecordedKind):
         valid = cast("RecordedKind", kind)
@@ -300,18 +302,18 @@ def _undeclared(kind: object, dtype: object) -> declarations.DeclaredType:
 
 # === episode block ============================================================================================
 #
-# An `EpisodeBlock` is an object that an executive reports to, whose `with` block is one episode.
+# An executive reports to an `EpisodeBlock`; each `with` block of it is one episode.
 
 
 class EpisodeBlock:
     """Opens an episode when its block begins, and closes it when the block ends; it can be entered again after that.
 
     Args:
-        executive: name and version of the executive, which are in the metadata of the episode.
-        episode: the arguments of `Recording.episode`. A `metadata` takes the place of the executive.
+        executive: name and version of the executive, stored in the metadata of the episode.
+        episode: the arguments of `Recording.episode`. A `metadata` among them replaces that of `executive`.
 
     Attributes:
-        episode: the episode of the block, for all that the object does not record itself.
+        episode: the episode of the block; its methods record what the object has no method for.
     """
 
     episode: RecordedEpisode
