@@ -19,12 +19,16 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Blob
 from pycrorm_async.record.episode_writer import THREAD_NAME_PREFIX, Emitter, EpisodeWriter, name_of, put_observation
-from pycrorm_async.record.values import ARRAY_ITEMS_MAX
+from pycrorm_async.record.values import ARRAY_ITEMS_MAX, clean, cut, message_of
 
 _SIGNATURES: Final = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg", b"GIF8": "image/gif"}
 _SIGNATURES_OF_WEBP: Final = b"RIFF", b"WEBP"
+_LEAST: Final = 1e-6
+"""The least rate: an image in eleven days."""
 _CLOSE_S: Final = 5.0
 """Bounds the wait of `close` for the image that is being recorded, which takes milliseconds."""
+_REASON_MAX: Final = 500
+"""Bounds the characters of a reason, which may be the message of a caller's exception."""
 
 
 def image_type(content: bytes) -> str:
@@ -66,15 +70,15 @@ class CameraStream:
     ) -> None:
         bounds: dict[str, object] = {"hz": hz, "bytes_per_s": bytes_per_s}
         for argument, number in bounds.items():
-            if not isinstance(number, int | float) or not 0 < number < float("inf"):
-                raise CallerError(f"{argument} must be a number above zero, got {number!r:.100}")
+            if not isinstance(number, int | float) or not _LEAST <= number < float("inf"):
+                raise CallerError(f"{argument} must be a number, {_LEAST:g} or above, got {number!r:.100}")
         self.name: Final = name_of(name)
         self.recorded = self.left_out = 0
         self._record, self._emitter, self._clock = record, emitter, clock
         self._period_ns = int(1e9 / hz)
         self._bytes_per_s = bytes_per_s
         self._due_ns = self._affordable_ns = clock.monotonic_ns()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a handler of the log may put an image
         self._waiting: Any = None
         self._writer: threading.Thread | None = None
         self._frames: tuple[asyncio.AbstractEventLoop, asyncio.Task[None]] | None = None
@@ -110,7 +114,7 @@ class CameraStream:
                     writer.start()
                     self._writer = writer
             except Exception as reason:  # noqa: BLE001  the image is the caller's, and may raise anything
-                self._leave_out(str(reason))
+                self._leave_out(message_of(reason))
 
     def read(self, frames: object) -> Self:
         """Put each image of an asynchronous iterator, in a task of the running loop. Raises `CallerError`."""
@@ -124,7 +128,10 @@ class CameraStream:
         return self
 
     def close(self) -> None:
-        """Record nothing more, when the image that is being recorded has been. Blocks for milliseconds."""
+        """Record nothing more, when the image that is being recorded has been.
+
+        Blocks for milliseconds, or up to 5 s while the disk stalls.
+        """
         self._is_closed = True
         if self._frames is not None:
             loop, task = self._frames
@@ -147,7 +154,7 @@ class CameraStream:
                     return
                 self.put(image)
         except Exception as error:  # noqa: BLE001  of the caller's iterator, which must not stop the plan
-            self._emitter.missing.note("camera", self.name, f"its frames ended with {type(error).__name__}: {error}")
+            self._note(f"its frames ended with {type(error).__name__}: {message_of(error)}")
 
     def _write(self) -> None:
         while True:
@@ -167,7 +174,10 @@ class CameraStream:
 
     def _leave_out(self, reason: str) -> None:
         self.left_out += 1
-        self._emitter.missing.note("camera", self.name, reason)
+        self._note(reason)
+
+    def _note(self, reason: str) -> None:
+        self._emitter.missing.note("camera", self.name, cut(clean(reason), _REASON_MAX))
 
 
 def _copied(image: Any) -> tuple[object, int]:

@@ -204,7 +204,7 @@ def test_an_executive_of_ones_own_records_a_camera_from_its_threads(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"hz": 0}, {"hz": "2"}, {"bytes_per_s": -1}, {"hz": float("nan")}, {"frames": [GREY]}]
+    "wrong", [{"hz": 0}, {"hz": 1e-300}, {"hz": "2"}, {"bytes_per_s": -1}, {"hz": float("nan")}, {"frames": [GREY]}]
 )
 async def test_an_argument_that_does_not_fit_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
     async with Memory.open(put_memory(tmp_path / "memory.db")) as memory:
