@@ -16,7 +16,7 @@ LONGEST: Final = """
     integrations/pycram/test_unusual_plans integrations/pycram/test_plans promises/test_pages crash/test_crash_points
     crash/test_daemon crash/test_cancelled promises/test_defects_of_storage crash/test_many_machines
     promises/test_without_bullet crash/test_rebuild_kill crash/test_killed promises/test_one_bad_episode
-    promises/test_every_format promises/test_clock_steps
+    promises/test_every_format promises/test_clock_steps recall/test_prediction
 """.split()
 """The modules with a test of 5 s or more, the longest first. Most tests of a run take less than 0.1 s."""
 

@@ -16,6 +16,9 @@ numbers. Heights are compared over the torso, because the reach of an arm depend
 (tries + 2) among all tries with such objects, counts as one try. These are the score and the prior of
 `recall.experience`, for every type of action. The interval is Wilson's for the sum of w of all tries, so that a try
 that is less alike counts less; with less than `EVIDENCE_MIN` it is 0 to 1, because nothing is known.
+
+Where a success model has ranked the action (`MoveAndPickUp(policy=model)`), its prediction takes the place of the
+prior, and the interval counts it as one try, so that it decides where little is remembered.
 """
 
 from __future__ import annotations
@@ -73,7 +76,7 @@ class Prediction:
         tries: the number of remembered tries that it rests on, each counted by its likeness, 0 to 1.
         cases: ids of the task-tree nodes of the tries most like it, the likest first.
         reason: the failure that is most likely if it fails; None if no try like it failed.
-        source: `recall`, or the name of the model that computed the chance.
+        source: `recall`, or the name of the model whose prediction counts as one try.
     """
 
     chance: float
@@ -95,8 +98,8 @@ class Prediction:
             return f"not known: {self.tries:.1f} tries like it are not enough"
         interval = f"{100 * self.chance:.0f} % ({100 * self.low:.0f}-{100 * self.high:.0f} %)"
         fails = f"; if it fails, most likely by {self.reason}" if self.reason else ""
-        source = f"{self.tries:.1f} tries like it" if self.source == "recall" else f"the model {self.source}"
-        return f"{interval} from {source}{fails}"
+        model = "" if self.source == "recall" else f" and the model {self.source}"
+        return f"{interval} from {self.tries:.1f} tries like it{model}{fails}"
 
 
 class Situation(NamedTuple):
@@ -107,12 +110,15 @@ class Situation(NamedTuple):
         words: the words that a try must have, by feature.
         numbers: each with its tolerance; None means the standard deviation among the tries.
         over_torso: features among `numbers` from which the height of the torso is subtracted.
+        expected, model: the chance that a model has predicted, and its name; None without a model.
     """
 
     type: str
     words: Mapping[str, str]
     numbers: Sequence[Wanted]
     over_torso: frozenset[str] = frozenset()
+    expected: float | None = None
+    model: str | None = None
 
 
 def predict(library: CaseLibrary, situations: Iterable[Situation]) -> list[Prediction]:
@@ -152,17 +158,19 @@ class _Tries:
         return cls(chosen, successes, count)
 
     def prediction(self, situation: Situation, library: CaseLibrary) -> Prediction:
-        tries = self._tries
-        if tries is None:
-            return Prediction(self._prior, 0.0, 1.0, 0.0, (), None)
-        likeness = np.exp(-_distance(tries, situation, library) / 2)
-        succeeded = tries.texts["status"].having("SUCCEEDED")
-        evidence, successes = float(likeness.sum()), float(likeness[succeeded].sum())
-        chance = (successes + self._prior) / (evidence + 1)
-        low, high = interval_95(successes, evidence) if evidence >= EVIDENCE_MIN else _UNKNOWN
-        order = np.argsort(-likeness, kind="stable")[:_CASES_MAX]
-        cases = tuple(tries.nodes[order[likeness[order] >= _LIKE_MIN]].tolist())
-        return Prediction(chance, min(low, chance), max(high, chance), evidence, cases, _reason(tries, likeness))
+        tries, prior, expected = self._tries, self._prior, situation.expected
+        evidence, successes, cases, reason = 0.0, 0.0, (), None
+        if tries is not None:
+            likeness = np.exp(-_distance(tries, situation, library) / 2)
+            succeeded = tries.texts["status"].having("SUCCEEDED")
+            evidence, successes = float(likeness.sum()), float(likeness[succeeded].sum())
+            order = np.argsort(-likeness, kind="stable")[:_CASES_MAX]
+            cases, reason = tuple(tries.nodes[order[likeness[order] >= _LIKE_MIN]].tolist()), _reason(tries, likeness)
+        prior, of_model = (prior, 0) if expected is None else (expected, 1)
+        chance, count = (successes + prior) / (evidence + 1), evidence + of_model
+        low, high = interval_95(successes + of_model * prior, count) if count >= EVIDENCE_MIN else _UNKNOWN
+        source = (situation.model or "a model") if of_model else "recall"
+        return Prediction(chance, min(low, chance), max(high, chance), evidence, cases, reason, source)
 
 
 def _ended(group: Group) -> NDArray[np.bool_]:
@@ -222,7 +230,7 @@ def situations_of(actions: Sequence[Designator]) -> list[Situation]:
     """Return the situation of each action, as if it began now.
 
     A `MoveAndPickUpPerformable` is compared as the pick-up that it makes at its place, with all tries of pick-ups; its
-    `torso`, if it has one, is the height to which it lifts the torso.
+    `torso`, if it has one, is the height to which it lifts the torso, and `probability` what a model has predicted.
     """
     world = current_world.get()
     sequences = _sequences(world) if world is not None else {}
@@ -230,14 +238,12 @@ def situations_of(actions: Sequence[Designator]) -> list[Situation]:
     types: dict[type[Designator], tuple[Sequence[Field], case_rows.FeatureFields]] = {}
     situations = []
     for each in actions:
-        action, place, torso = each, None, None
+        action, place, torso, expected, model = each, None, None, None, None
         if isinstance(each, MoveAndPickUpPerformable):
             target, height_m = pose_of(each.object_designator), each.standing_position.position.z
             place = face(each.standing_position, target, height_m=height_m)
-            action, torso = (
-                PickUpActionPerformable(each.object_designator, each.arm, each.grasp),
-                vars(each).get("torso"),
-            )
+            action = PickUpActionPerformable(each.object_designator, each.arm, each.grasp)
+            torso, expected, model = getattr(each, "torso", None), getattr(each, "probability", None), each.policy
         if type(action) not in types:
             declared = declared_type(type(action), strict=False)
             types[type(action)] = declared.fields, case_rows.FeatureFields.of(declared.declaration)
@@ -247,7 +253,8 @@ def situations_of(actions: Sequence[Designator]) -> list[Situation]:
         # As the event of its start has them.
         recorded = msgspec.json.decode(msgspec.json.encode({k: v for k, v in parameters.items() if k not in missing}))
         robot = _robot(world, sequences, place, torso) if world is not None else None
-        situations.append(compared(fields.dtype, *case_rows.situation(fields, recorded, robot, replayed), fields))
+        situation = compared(fields.dtype, *case_rows.situation(fields, recorded, robot, replayed), fields)
+        situations.append(situation._replace(expected=expected, model=model))
     return situations
 
 
