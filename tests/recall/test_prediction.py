@@ -102,7 +102,7 @@ def test_angles_are_compared_round_the_circle_and_a_try_without_a_number_counts_
 
 def test_the_height_of_a_goal_is_compared_over_the_torso() -> None:
     fields = FeatureFields("PlaceAction", (), (), (("goal", ("goal_x", "goal_y", "goal_z", "goal_yaw")),), (), "action")
-    situation = compared("PickUpAction", LEFT, {"goal_z": 1.0, "torso": 0.3}, fields)
+    situation = compared("PickUpAction", {**LEFT}, {"goal_z": 1.0, "torso": 0.3}, fields)
     lower = tried(1, -0.7)._replace(numbers={"goal_z": 0.8, "torso": 0.1})
     assert predicted(situation, lower).tries == pytest.approx(1, abs=1e-6)
 
