@@ -162,7 +162,7 @@ async def rebind(
 ) -> Rebinding:
     """Bind a spool to the database that is at this URL now, creating it if it is missing; `recover` then stores it.
 
-    Calls `on_rebinding` before it changes anything. Raises `SpoolTaken` where a process records into the spool or
+    Calls `on_rebinding` before it changes the spool. Raises `SpoolTaken` where a process records into the spool or
     drains it.
     """
     address, settings = shared_address(url), settings or Settings()

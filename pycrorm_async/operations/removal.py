@@ -9,8 +9,8 @@ refuses the deletion outside of such a transaction, and on PostgreSQL to all log
 
 A lake is erased before this transaction, because the transaction overwrites the row that names the lake. After it
 follow the pages of the file and the segments that the spool keeps. The row says when nothing was left
-(`finished_wall_ns`); until then the same command continues, also after a kill at any step. A lake in which files were
-left is visited again only if `--lake` names it.
+(`finished_wall_ns`); until then the same command continues, also after a kill at any step. It visits a lake again in
+which files were left, where `--lake` names it or the episode was archived in it.
 
 On PostgreSQL the tables may belong to another role, whose code must not run with the rights of the owner. The owner
 then removes only the events; the same command, run by a login of that role, removes the rows of the tables.
@@ -100,16 +100,17 @@ async def erase(
     for each in [*archived, *await log.restored(each.id for each in rows)]:
         lakes.setdefault(each.archived_in or "", []).append(each.id)
     left: list[str] = []
+    held_in: dict[str | None, str] = {}
     for address, ids in lakes.items():
         again = f"of an archive that runs or was killed: run `pycrorm erase` in an hour, with --lake {address}"
-        left += [f"{each}, {again}" for each in erase_in_lake(address, ids)]
+        if files := erase_in_lake(address, ids):
+            left += [f"{each}, {again}" for each in files]
+            held_in[address] = address
     if archived:
         async with log.writing() as connection:
             now_ns = SYSTEM_CLOCK.wall_ns()
-            changed = [
-                each._replace(archived_in=None, removed_wall_ns=now_ns, reason=reason, finished_wall_ns=None)
-                for each in archived
-            ]
+            begun = [each._replace(removed_wall_ns=now_ns, reason=reason, finished_wall_ns=None) for each in archived]
+            changed = [each._replace(archived_in=held_in.get(each.archived_in)) for each in begun]
             await dialect_of(connection).execute(connection, schema.UPSERT_REMOVED, removed=changed)
     there = [each for each in rows if isinstance(each, EpisodeRow)]
     for some in parts(there, EVENTS_AT_ONCE):

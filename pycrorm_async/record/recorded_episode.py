@@ -64,7 +64,7 @@ def reported(
 FOREVER_S = 1e8
 """The seconds that a start waits for room: three years, because a wait takes a number."""
 FailureCause: TypeAlias = BaseException | event_types.FailureValue | tuple[str, str] | str
-"""A failure as an executive gives it: an exception, a pair of reason and message, or a text."""
+"""A failure as an executive gives it: an exception, a `FailureValue`, a pair of reason and message, or a text."""
 END_STATUSES = tuple(each for each in get_args(event_types.NodeStatus) if each != "RUNNING")
 
 

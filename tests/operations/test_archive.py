@@ -289,6 +289,21 @@ async def test_files_of_an_archive_that_was_killed_before_its_commit_are_deleted
     assert len(again) == 1
 
 
+async def test_an_erasure_that_left_files_in_the_lake_of_an_archived_episode_visits_that_lake_again(
+    tmp_path: Path, lake: str
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    [identity] = await recorded(url, SECRET)
+    assert ForkedProcess(archive_until_commit, url, lake).wait() == -9
+    orphans = parquet_files(lake)
+    await archived(url, lake)
+    [done] = await erased(url, identity)
+    assert len(done.left) == len(orphans) == 1
+    parquet_files(lake, aged=True)
+    assert [each.left for each in await erased(url, identity)] == [()]
+    assert not parquet_files(lake)
+
+
 async def test_a_lake_takes_no_episode_again_that_was_erased_from_it(tmp_path: Path, lake: str) -> None:
     url, other = put_memory(tmp_path / "memory.db"), put_memory(tmp_path / "other.db")
     [identity] = await recorded(url, SECRET)
