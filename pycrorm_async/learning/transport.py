@@ -37,7 +37,7 @@ from pycrorm_async.world.pose import Arms, Grasp, Pose, dot
 from pycrorm_async.world.queries import OccupancyCostmap
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS
 
-CHECKED_MAX = 60
+CHECKED_MAX = 200
 """Bounds the places that are checked to find out whether an arm and a grasp can place an object at all."""
 _ALIKE_M = 0.1
 """The distance in m, of the base and of the torso, at which two ways with the same arm and grasp are half alike."""
@@ -89,12 +89,18 @@ class TransportPolicy:
             return
         action = MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
         action.keep_policy()
-        choices, rates = action.rated(PROPOSALS)
-        chances = rates * [placeable(each.arm, each.grasp) for each in choices]
+        choices, chances = action.rated(PROPOSALS)
         clearance = locations.base_clearance()
+        weighed: set[tuple[Arms, Grasp]] = set()
         while chances.any():
             best = int(chances.argmax())
-            choice, chances[best] = choices[best], 0.0
+            choice = choices[best]
+            hold = choice.arm, choice.grasp
+            if hold not in weighed:  # until then its chance is too high, so that no better one is missed
+                weighed.add(hold)
+                chances = chances * np.where([each[:2] == hold for each in choices], placeable(*hold), 1.0)
+                continue
+            chances[best] = 0.0
             if clearance is not None and not action.is_clear(choice, clearance):
                 continue
             if self.reaches(way := action.way(choice)):

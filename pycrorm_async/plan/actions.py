@@ -704,15 +704,24 @@ class TransportAction(ActionDescription[TransportActionPerformable]):
         return super().__iter__()
 
     async def __aiter__(self) -> AsyncGenerator[TransportActionPerformable, None]:
-        """Yield what the policy chooses for each object and place; without one, every combination."""
+        """Yield what the policy chooses for each object and place; without one, every combination.
+
+        Raises `ObjectUnfetchable` if the policy has no way.
+        """
         if self._policy is None:
             for each in super().__iter__():
                 yield each
             return
         among, arms, goals = (self._choices(name, each) for name, each in self._alternatives.items())
+        offers = False
         for target, goal in itertools.product(among, goals):
             async for each in self._chosen(self._policy, target, arms, goal):
+                offers = True
                 yield each
+        if not offers:
+            names = ", ".join(each.name for each in among)
+            message = f"there is no way to fetch {names} with which it can be placed at its goal"
+            raise failures.ObjectUnfetchable(message, names)
 
     async def _chosen(
         self, policy: TransportWays, target: objects.ObjectDesignator | Object, arms: Sequence[Arms], goal: Pose

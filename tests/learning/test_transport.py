@@ -61,7 +61,7 @@ async def test_a_task_ends_the_same_in_any_order_and_world() -> None:
     def ends(numbers: list[int]) -> dict[int, Any]:
         return dict(zip(numbers, tasks.in_process("random, checked", None, tasks.ERRORS, 69, numbers), strict=True))
 
-    forth, back = [await asyncio.to_thread(ends, each) for each in ([0, 1, 2, 4], [4, 2, 1, 0])]
+    forth, back = [await asyncio.to_thread(ends, each) for each in ([0, 4], [4, 0])]
     assert forth == back
     assert any(each.placed for each in forth.values())
 
@@ -90,7 +90,7 @@ async def test_a_policy_is_asked_with_async_for_and_says_so() -> None:
         thing, goal = here.prepare(69, 4)
         with pytest.raises(CallerError, match="iterate with `async for`"):
             next(iter(TransportAction(thing, ARMS, [goal], policy=policy())))
-        with pytest.raises(PlanFailure, match="no alternative"):  # the goal is out of reach for any arm
+        with pytest.raises(PlanFailure, match=r"no way to fetch .* placed at its goal"):
             await Retry(TransportAction(thing, ARMS, [Pose((0, 0, 3))], policy=policy()), max_tries=2).perform()
         with pytest.raises(ReachabilityFailure, match="no place to stand and place"):
             policy().placing(thing, Arms.LEFT, Pose((0, 0, 3))).resolve()
