@@ -69,7 +69,9 @@ def grip_ceiling(target: Object, errors: Disturbance) -> float:
     """Return the chance that the best grasp of the object holds it, wherever the robot stands."""
     opening = PR2.arms[next(iter(PR2.arms))].opening_m or math.inf
     rng = np.random.default_rng(0)
-    size = target.bounding_box().size if not errors.object_rad else target.box_in_link(target.links[0]).size  # type: ignore[union-attr]
+    box = target.box_in_link(target.links[0])
+    assert box is not None
+    size = box.size
     off, turn = rng.normal(0, errors.object_m, 100_000), rng.normal(0, errors.object_rad, 100_000)
     is_round = not target.body.solids[target.links[0]][0].is_box
     held = []

@@ -260,6 +260,19 @@ def an_advised_plan_notes_the_chance_of_what_it_tries(reader: PageReader) -> Non
     assert ask(reader.folder / "tries.db", "SELECT count(*) > 0 FROM observation WHERE name = 'advice'") == [(1,)]
 
 
+def rollouts_fail_where_a_table_and_errors_are_in_the_way(reader: PageReader) -> None:
+    reader.cell("""
+assert disturbed.rollouts == 50
+assert disturbed.failures["NavigationGoalInCollision"] > 0
+""")
+
+
+def the_milk_is_at_its_new_place(reader: PageReader) -> None:
+    reader.cell("""
+np.testing.assert_allclose(stage.target.pose.position, (1.3, 0.2, 0.9), atol=1e-6)
+""")
+
+
 def the_origins_of_the_policy_are_known(reader: PageReader) -> None:
     reader.cell("""
 from pycrorm_async.learning import name_of
@@ -297,6 +310,8 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
         "Learning from recorded episodes": a_policy_is_learned_from_the_recorded_rollouts,
         "Repeat what worked": a_recalled_way_succeeds,
         "Ask before acting": an_advised_plan_notes_the_chance_of_what_it_tries,
+        "Worlds that can fail": rollouts_fail_where_a_table_and_errors_are_in_the_way,
+        "Whole tasks": the_milk_is_at_its_new_place,
         "From which episodes a policy was learned": the_origins_of_the_policy_are_known,
     },
     "pycrorm_async/operations/README.md": {
