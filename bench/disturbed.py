@@ -119,10 +119,10 @@ async def measure(name: str, folder: Path, scenes: int, rollouts: int | None) ->
             kind, done, possible = await tried(stage, policy, index)
             ends[kind].append((done, possible))
         ceilings = {each.name: grip_ceiling(each, case.scene.disturbance) for each in stage.targets}
-    rows = []
+    rows: list[dict[str, Any]] = []
     for kind, flags in ends.items():
-        successes, possible, count = sum(each for each, _ in flags), sum(each for _, each in flags), len(flags)
-        ceiling = possible / count if case.scene.table else ceilings[kind]
+        successes, solvable, count = sum(each for each, _ in flags), sum(each for _, each in flags), len(flags)
+        ceiling = solvable / count if case.scene.table else ceilings[kind]
         rate = successes / count
         rows.append({
             "case": name, "object": kind, "scenes": count, "first_try": round(rate, 4),
@@ -130,11 +130,11 @@ async def measure(name: str, folder: Path, scenes: int, rollouts: int | None) ->
             "of_ceiling": round(rate / ceiling, 4) if ceiling else None,
         })  # fmt: skip
     if case.scene.table:
-        successes, possible = (sum(each[at] for flags in ends.values() for each in flags) for at in (0, 1))
+        successes, solvable = (sum(each[at] for flags in ends.values() for each in flags) for at in (0, 1))
         rows.append({
             "case": name, "object": "all", "scenes": scenes, "first_try": round(successes / scenes, 4),
             "interval": [round(each, 3) for each in interval_95(successes, scenes)],
-            "ceiling": round(possible / scenes, 4), "of_ceiling": round(successes / possible, 4) if possible else None,
+            "ceiling": round(solvable / scenes, 4), "of_ceiling": round(successes / solvable, 4) if solvable else None,
         })  # fmt: skip
     return rows
 
