@@ -281,9 +281,10 @@ class RefusedByPrediction(PlanFailure):
         self, alternatives: int, chance: float, low: float, high: float, minimum: float, reason: str | None
     ) -> None:
         expected = f", most likely by {reason}" if reason is not None else ""
+        count = "1 alternative was" if alternatives == 1 else f"{alternatives} alternatives were"
         super().__init__(
-            f"{alternatives} alternatives were refused, because the memory expects them to fail{expected}: the best one"
-            f" succeeds with {chance:.0%} ({low:.0%} to {high:.0%}), less than {minimum:.0%}"
+            f"{count} refused, because the memory expects a failure{expected}: the best one succeeds with"
+            f" {chance:.0%} ({low:.0%} to {high:.0%}), less than {minimum:.0%}"
         )
         self.args = (alternatives, chance, low, high, minimum, reason)
         self.alternatives = alternatives

@@ -396,6 +396,7 @@ class MemoryAdviser:
         try:
             return self._asking.result()
         except asyncio.InvalidStateError:
+            self._asking.add_done_callback(lambda late: late.cancelled() or late.exception())  # else asyncio logs it
             self._note_failure(f"no answer in {ANSWER_WAIT_S:g} s")
         except Exception as error:  # noqa: BLE001  whatever fails in a memory, the plan goes on
             self._note_failure(describe_error(error))
