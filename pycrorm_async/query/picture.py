@@ -130,12 +130,15 @@ def _moving(number: int) -> Select[Any]:
 def _drawn(
     then: Moment, moved: Collection[str], size: tuple[int, int], yaw_deg: float | None, pitch_deg: float
 ) -> bytes:
-    with world_of(_drawable(then)) as world:
+    drawable = _drawable(then)
+    pairs = zip(then.world.objects, drawable.world.objects, strict=True)
+    framed = {drawn.name for recorded, drawn in pairs if recorded.name in moved}
+    with world_of(drawable) as world:
         points = [name for name, shape in world.assumed.items() if shape.startswith("a point")]
         if len(points) == len(world.objects):
             reason = world.assumed[points[0]].removeprefix("a point, because ")
             raise CallerError(f"episode {then.number} has no shapes to draw: of {points[0]}, {reason}")
-        camera = _camera(world, {visible(each, kept="") for each in moved}, size, yaw_deg, pitch_deg)
+        camera = _camera(world, framed.difference(points) or framed, size, yaw_deg, pitch_deg)
         return png(photograph(world, camera, *size).pixels)
 
 

@@ -87,7 +87,8 @@ async def findings_for_any_parts(log: EventLog, url: str, monkeypatch: pytest.Mo
 
 ONE_MORE = "INSERT INTO event SELECT {}, {}, type, version, wall_ns, monotonic_ns, payload FROM event"
 OF_2 = "WHERE episode = 2 AND sequence = "
-ENDED = "UPDATE event SET (type, payload) = (SELECT type, payload FROM event WHERE episode = 1 AND sequence = 20)"
+COPIED = "type, version, payload"
+ENDED = f"UPDATE event SET ({COPIED}) = (SELECT {COPIED} FROM event WHERE episode = 1 AND sequence = 20)"
 CANNOT = "is in the tables, and cannot be folded:"
 
 
