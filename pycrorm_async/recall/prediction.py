@@ -377,7 +377,7 @@ class MemoryAdviser:
         self._observe = observe
         self._minimum = minimum
         self._explore = explore
-        self._asking: asyncio.Task[Sequence[Prediction]] | None = None
+        self._late: set[asyncio.Task[Sequence[Prediction]]] = set()  # questions that no plan waits for any longer
         self._has_failed = False
 
     @property
@@ -389,14 +389,18 @@ class MemoryAdviser:
         return chance.chance >= self._minimum if is_known else self._explore
 
     async def chances(self, alternatives: Sequence[Designator]) -> Sequence[Prediction] | None:
-        if self._asking is not None and not self._asking.done():
+        if not all(each.done() for each in self._late):
             return None  # the memory still works on an earlier question, as reading many cases for the first time
-        self._asking = asyncio.create_task(self._predict([*alternatives]), name="prediction for a plan")
-        await asyncio.wait([self._asking], timeout=ANSWER_WAIT_S)
+        asking = asyncio.create_task(self._predict([*alternatives]), name="prediction for a plan")
         try:
-            return self._asking.result()
+            await asyncio.wait([asking], timeout=ANSWER_WAIT_S)
+        finally:
+            if not asking.done():
+                self._late.add(asking)
+                asking.add_done_callback(self._forget)
+        try:
+            return asking.result()
         except asyncio.InvalidStateError:
-            self._asking.add_done_callback(lambda late: late.cancelled() or late.exception())  # else asyncio logs it
             self._note_failure(f"no answer in {ANSWER_WAIT_S:g} s")
         except Exception as error:  # noqa: BLE001  whatever fails in a memory, the plan goes on
             self._note_failure(describe_error(error))
@@ -409,9 +413,13 @@ class MemoryAdviser:
         self._observe("advice", {**figures, "alternatives": len(chances), "refused": refused})
 
     def close(self) -> None:
-        """Drop the question that the memory still works on."""
-        if self._asking is not None:
-            self._asking.cancel()
+        """Drop the questions that no plan waits for any longer."""
+        for each in self._late:
+            each.cancel()
+
+    def _forget(self, asked: asyncio.Task[Sequence[Prediction]]) -> None:
+        self._late.discard(asked)
+        asked.cancelled() or asked.exception()  # else asyncio logs it
 
     def _note_failure(self, reason: str) -> None:
         if not self._has_failed:

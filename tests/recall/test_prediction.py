@@ -295,6 +295,19 @@ async def test_a_plan_does_not_wait_for_a_memory_that_does_not_answer(
     ]
 
 
+async def test_parallel_plans_are_all_advised_and_one_that_outlives_the_advice_ends_as_others() -> None:
+    async with Memory.open("sqlite://") as memory:
+        await filled(memory)
+        async with memory.episode(description="parallel"):
+            with collected_tree() as tree, memory.advising(minimum=0.5):
+                await (GripSliding([1.5, 0.5]) | GripSliding([1.5, 0.5])).perform()
+                outliving = asyncio.create_task(Retry(GripSliding([1.5, 0.5]), max_tries=1).perform())
+                await asyncio.sleep(0)  # so that it asks
+                await asyncio.sleep(0)
+            await outliving
+            assert levels_of(tree) == [0.5, 0.5, 0.5]
+
+
 def test_a_minimum_is_a_chance() -> None:
     with (
         pytest.raises(CallerError, match="minimum must be a chance from 0 to 1, got 30"),
