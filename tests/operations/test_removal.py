@@ -25,6 +25,8 @@ from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import pycrorm
 from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import Server, ask, ask_to_change, change_each
+from tests.golden.unpacking import unpack_memory
+from tests.golden.zoo import ZOO
 from tests.memory.note_actions import NoteActionPerformable
 from tests.table_comparison import Tables, differences, logs_of, tables_of
 
@@ -127,6 +129,14 @@ async def test_an_erased_episode_is_in_no_table_and_no_file_and_the_others_are_a
             await reading.tree(ids[1])
     await recorded(database_url, "fourth")
     assert [number for (number,) in ask(database_url, "SELECT number FROM episode ORDER BY number")] == [1, 3, 4]
+
+
+@pytest.mark.parametrize("member", ["fold_1", "fold_4_cases", "fold_9_cases_2"])
+async def test_an_episode_is_erased_from_tables_and_cases_of_an_earlier_version(member: str, tmp_path: Path) -> None:
+    url = unpack_memory(ZOO / f"{member}.tar.gz", tmp_path)
+    await erased(url, "1")
+    assert places_with("poured", url) == []
+    assert ask(url, "SELECT number, reason FROM pycrorm_removed_episode") == [(1, "asked to")]
 
 
 async def test_the_number_of_the_last_episode_is_not_given_to_another_one(database_url: str, in_folder: Path) -> None:
