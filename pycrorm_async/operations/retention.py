@@ -12,19 +12,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from sqlalchemy import select
+from sqlalchemy import column, select, table
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.operations.removal import ErasedEpisode, erase
-from pycrorm_async.orm.episodes import EpisodeTag
 from pycrorm_async.progress_bar import ProgressCallback
+from pycrorm_async.projections.columns import EPISODE, physical_name
+from pycrorm_async.projections.generations import PROJECTION_VERSION, SHOWN, read_generation
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, tags_of
@@ -137,12 +138,14 @@ async def remove_rule(log: EventLog, number: int) -> RetentionRule:
 async def due_episodes(log: EventLog, rules: Sequence[RetentionRule], now_ns: int) -> list[DueEpisode]:
     """Return the episodes that rules no longer keep at this time, by number.
 
-    The tables say which may be due, because an index finds their tags; the log, which may have later ones, decides.
+    The tables, if they are of this version, say which may be due, because an index finds their tags; the log, which may
+    have later ones, decides.
     """
     tags_by_number = await _tags_in_tables(log, {tag for each in rules for tag in each.tags})
     due: list[DueEpisode] = []
     for row in await log.episodes():
-        if _rule_that_ended(rules, tags_by_number.get(row.number, ()), row, now_ns) is not None:
+        folded = () if tags_by_number is None else tags_by_number.get(row.number, ())
+        if tags_by_number is None or _rule_that_ended(rules, folded, row, now_ns) is not None:
             tags = await tags_of(log, row)
             rule = _rule_that_ended(rules, tags, row, now_ns)
             if rule is not None:
@@ -159,16 +162,23 @@ def _rule_that_ended(
     return rule if row.ended_wall_ns < now_ns - rule.keep_s * 10**9 else None
 
 
-async def _tags_in_tables(log: EventLog, names: Collection[str]) -> dict[int, set[str]]:
-    """Return which of these tags the episodes have, by number, as far as they are folded."""
+async def _tags_in_tables(log: EventLog, names: Collection[str]) -> Mapping[int, Collection[str]] | None:
+    """Return which of these tags the episodes have, by number, as far as they are folded.
+
+    Returns None where the tables are missing or of another version.
+    """
     tags: dict[int, set[str]] = {}
     async with log.reading() as connection:
-        if names and await dialect_of(connection).has_table(connection, "pycrorm_generation"):
-            tag = EpisodeTag.__table__.c
-            for number, name in await connection.execute(
-                select(tag.process_metadata_id, tag.tag).where(tag.tag.in_(sorted(names)))
-            ):
-                tags.setdefault(number, set()).add(name)
+        generation = await read_generation(connection, SHOWN)
+        if generation is None or generation.version != PROJECTION_VERSION:
+            return None
+        # Not the view `episode_tag`, which leaves out simulations.
+        columns = [column(each) for each in (EPISODE, "tag", "added", "id", "position")]
+        change = table(physical_name("episode_tagging", generation.number), *columns).c
+        changes = select(change[EPISODE], change.tag, change.added).where(change.tag.in_(sorted(names)))
+        for number, name, added in await connection.execute(changes.order_by(change.id, change.position)):
+            some = tags.setdefault(number, set())
+            some.add(name) if added else some.discard(name)
     return tags
 
 
@@ -195,7 +205,7 @@ async def apply_rules(
     ]
     if parts:
         result.erased.extend(await erase(log, parts, reason=_VERB, spool=spool))
-    for rule, rows in by_rule.items():
+    for rule, rows in sorted(by_rule.items(), key=lambda each: each[0].archive_to is not None):  # a lake may be away
         if rule.archive_to is None:
             result.erased.extend(await erase(log, rows, reason=str(rule), spool=spool))
             continue

@@ -10,6 +10,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.types import EpisodeTagged
 from pycrorm_async.operations.copy import _append
 from pycrorm_async.operations.retention import (
@@ -25,6 +26,8 @@ from pycrorm_async.store.lake import query_lake
 from pycrorm_async.store.log import EventLog
 from tests.commands import one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
+from tests.golden.unpacking import unpack_memory
+from tests.golden.zoo import ZOO
 from tests.operations.test_removal import PATIENT, assert_clean, places_with
 
 DAY_S = 86_400
@@ -131,6 +134,51 @@ async def test_a_tag_that_is_not_in_the_tables_yet_keeps_its_episode(tmp_path: P
         await _append(log, row, EpisodeTagged(("keep",), ()), SYSTEM_CLOCK)
         assert ask(url, "SELECT folded < head FROM episode") == [(1,)]
         assert await due_episodes(log, rules, 2**62) == []
+    finally:
+        await log.close()
+
+
+async def due_after_a_day(url: str, *tags: str) -> list[int]:
+    """Return the due episodes of a memory in which episodes with these tags stay for a day."""
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        await add_rule(log, "1d", timedelta(days=1), tags, None)
+        return [each.row.number for each in await due_episodes(log, await read_rules(log), 2**62)]
+    finally:
+        await log.close()
+
+
+@pytest.mark.slow
+async def test_a_rule_concerns_simulations_too(database_url: str, tmp_path: Path) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool", settings=PATIENT) as memory:
+        memory.recording.episode(description="thought", simulated=True, tags=("tryout",)).close()
+        async with memory.episode(description="kept"):
+            pass
+    assert await due_after_a_day(database_url, "tryout") == [1]
+
+
+@pytest.mark.slow
+async def test_without_tables_of_this_version_the_tags_are_read_from_the_log(tmp_path: Path) -> None:
+    url = unpack_memory(ZOO / "fold_3.tar.gz", tmp_path)
+    assert await due_after_a_day(url, "tryout") == []
+    assert await due_after_a_day(url) == [1]
+
+
+@pytest.mark.slow
+async def test_a_lake_that_is_away_does_not_keep_what_is_to_be_erased(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url) as memory:
+        for tags in (("moved",), ()):
+            async with memory.episode(description="old", tags=tags):
+                pass
+    (tmp_path / "away").touch()  # where the folder of the lake was
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        await add_rule(log, "1d", timedelta(days=1), ("moved",), f"ducklake:{tmp_path}/away")
+        await add_rule(log, "1d", timedelta(days=1), (), None)
+        with pytest.raises(PycrormError):
+            await apply_rules(url, log, {1, 2}, 2**62, spool=tmp_path / "spool")
+        assert [each.number for each in await log.episodes()] == [1]
     finally:
         await log.close()
 
