@@ -15,9 +15,9 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import column, select, table
+from sqlalchemy import ColumnClause, column, select, table
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
@@ -173,7 +173,7 @@ async def _tags_in_tables(log: EventLog, names: Collection[str]) -> Mapping[int,
         if generation is None or generation.version != PROJECTION_VERSION:
             return None
         # Not the view `episode_tag`, which leaves out simulations.
-        columns = [column(each) for each in (EPISODE, "tag", "added", "id", "position")]
+        columns: list[ColumnClause[Any]] = [column(each) for each in (EPISODE, "tag", "added", "id", "position")]
         change = table(physical_name("episode_tagging", generation.number), *columns).c
         changes = select(change[EPISODE], change.tag, change.added).where(change.tag.in_(sorted(names)))
         for number, name, added in await connection.execute(changes.order_by(change.id, change.position)):
