@@ -397,12 +397,12 @@ async def _lag(log: EventLog, address: DatabaseAddress | None) -> tuple[ReplicaL
         return None, []
     try:
         replica = await EventLog.open(address, create=False)
+        try:
+            return await lag_between(replica, log, SETTLE_S), []
+        finally:
+            await replica.close()
     except DatabaseError as fault:
         return None, [f"the replica cannot be read: {fault}"]
-    try:
-        return await lag_between(replica, log, SETTLE_S), []
-    finally:
-        await replica.close()
 
 
 async def _outdated(log: EventLog) -> list[str]:

@@ -10,13 +10,15 @@ nor do the bytes alone, because PostgreSQL writes some now and then that no read
 behind when it has not replayed, after `SETTLE_S`, what the primary had written before.
 
 A reader that names a replica is refused one of another memory: a replica has the id of the log. While the replica
-does not answer, the primary does, and while the primary does not answer, the replica does.
+does not answer, or follows no server any more, the primary does, and while the primary does not answer, the replica
+does.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from datetime import datetime
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable
@@ -30,12 +32,15 @@ SETTLE_S: Final = 0.2
 _POLL_S: Final = 0.02
 
 _WRITTEN = """
-SELECT (CASE WHEN pg_catalog.pg_is_in_recovery() THEN pg_catalog.pg_last_wal_replay_lsn()
+SELECT pg_catalog.pg_postmaster_start_time(),
+(CASE WHEN pg_catalog.pg_is_in_recovery() THEN pg_catalog.pg_last_wal_replay_lsn()
 ELSE pg_catalog.pg_current_wal_flush_lsn() END - '0/0')::bigint"""
 _REPLAYED = """
-SELECT CASE WHEN pg_catalog.pg_is_in_recovery() THEN (pg_catalog.pg_last_wal_replay_lsn() - '0/0')::bigint END,
+SELECT pg_catalog.pg_postmaster_start_time(),
+CASE WHEN pg_catalog.pg_is_in_recovery() THEN (pg_catalog.pg_last_wal_replay_lsn() - '0/0')::bigint END,
 pg_catalog.date_part('epoch', pg_catalog.clock_timestamp() - pg_catalog.pg_last_xact_replay_timestamp())"""
-"""Selects the position, null for a server that is no replica (any more), and the age of the last replayed commit."""
+"""Selects the start of the server, which identifies it, the position, null for one that is no replica (any more), and
+the age of the last replayed commit."""
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -69,27 +74,28 @@ async def open_to_read(primary: DatabaseAddress, replica: DatabaseAddress | None
     if replica is None:
         return await EventLog.open(primary, create=False)
     check_replica(replica, primary)
+    log = None
     try:
         log = await EventLog.open(replica, create=False)
-    except DatabaseUnavailable as fault:
+        lag = await lag_of(log, primary)
+    except BaseException as fault:
+        if log is not None:
+            await log.close()
+        if not isinstance(fault, DatabaseUnavailable):
+            raise
         _log.warning("the replica does not answer: %s; reading from %s", fault, primary)
         return await EventLog.open(primary, create=False)
-    try:
-        lag = await lag_of(log, primary)
-    except BaseException:
-        await log.close()
-        raise
     if lag.behind_bytes is None or (lag.behind_bytes > 0 and (lag.last_change_s or 0.0) > LAG_S_MAX):
         _log.warning("the replica %s %s", replica, lag)
     return log
 
 
 async def lag_of(replica: EventLog, primary: DatabaseAddress) -> ReplicaLag:
-    """Return how far a replica is behind. Raises `CallerError` if it has another log than the primary."""
+    """Return how far a replica is behind. Raises as `lag_between` does."""
     try:
         log = await EventLog.open(primary, create=False)
     except DatabaseUnavailable:
-        return ReplicaLag(None, (await _replayed(replica))[1])
+        return ReplicaLag(None, (await _replayed(replica))[-1])
     try:
         return await lag_between(replica, log, SETTLE_S)
     finally:
@@ -99,22 +105,24 @@ async def lag_of(replica: EventLog, primary: DatabaseAddress) -> ReplicaLag:
 async def lag_between(replica: EventLog, primary: EventLog, patience_s: float) -> ReplicaLag:
     """Wait until the replica has what the primary has now, at most for this long; return how far it is behind then.
 
-    Raises `CallerError` if these are two memories.
+    Raises `CallerError` if these are two memories, and `DatabaseUnavailable` for one that follows no server any more.
     """
     if replica.log_id != primary.log_id:
         raise CallerError(f"{replica.address} holds another memory than {primary.address}: correct --read-url")
     async with primary.reading() as connection:
-        written = (await connection.exec_driver_sql(_WRITTEN)).scalar_one()
+        server, written = tuple((await connection.exec_driver_sql(_WRITTEN)).one())
     end_s = asyncio.get_running_loop().time() + patience_s
     while True:
-        position, last_change_s = await _replayed(replica)
+        own_server, position, last_change_s = await _replayed(replica)
+        if position is None and own_server != server:
+            raise DatabaseUnavailable(f"{replica.address} is promoted or a copy, and follows no other server")
         lacks = 0 if position is None else max(0, written - position)
         if not lacks or asyncio.get_running_loop().time() >= end_s:
             return ReplicaLag(lacks, last_change_s)
         await asyncio.sleep(_POLL_S)
 
 
-async def _replayed(replica: EventLog) -> tuple[int | None, float | None]:
+async def _replayed(replica: EventLog) -> tuple[datetime, int | None, float | None]:
     async with replica.reading() as connection:
-        position, last_change_s = tuple((await connection.exec_driver_sql(_REPLAYED)).one())
-    return position, last_change_s
+        started, position, last_change_s = tuple((await connection.exec_driver_sql(_REPLAYED)).one())
+    return started, position, last_change_s

@@ -136,6 +136,25 @@ async def test_a_replica_that_does_not_answer_is_replaced_by_the_memory_and_anot
                 pass
 
 
+async def test_a_replica_that_was_promoted_beside_its_primary_is_not_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, replicas_in(Path(folder), synchronous=False) as pair:
+        url, promoted = pair.url(), pair.standby_url()
+        async with Memory.open(url, read_url=promoted, spool=tmp_path / "spool", settings=SETTINGS) as memory:
+            await record(memory, 1)
+            ask(promoted, "SELECT pg_promote(true, 60)")
+            async with Reading.open(promoted, read_url=promoted) as reading:  # a URL may lead to the same server
+                assert (await steps(reading), caplog.records) == ([1], [])
+            await record(memory, 2)
+            assert await steps(memory) == [1, 2]
+        async with Reading.open(url, read_url=promoted) as reading:
+            assert await steps(reading) == [1, 2]
+        assert ["follows no other server" in each.getMessage() for each in caplog.records] == [True, True]
+        status = pycrorm("status", "--url", url, "--read-url", promoted, "--spool", tmp_path / "spool", cwd=tmp_path)
+        assert (status.returncode, "follows no other server" in status.stderr) == (0, True)
+
+
 async def test_a_url_may_name_both_servers_and_leads_to_the_one_that_takes_writes(
     replicas: Replicas, database: str, tmp_path: Path
 ) -> None:
