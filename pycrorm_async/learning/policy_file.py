@@ -84,7 +84,7 @@ def save_policy(policy: AnyPolicy, path: Path | str) -> None:
     path, content = Path(path), encode_policy(policy)
     version = 1 if isinstance(policy, Policy) else VERSION
     heading = msgspec.json.encode(_Heading(FORMAT, version, zlib.crc32(content)))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.parent / f".{path.name}.{os.getpid()}"
     try:
         temporary.write_bytes(heading + b"\n" + content + b"\n")
         temporary.replace(path)

@@ -363,6 +363,8 @@ def test_a_file_that_cannot_be_read_or_written_is_reported_in_one_line(tmp_path:
     (tmp_path / "taken").mkdir()
     with pytest.raises(PolicyFileRefused, match="cannot be written: "):
         save_policy(LEARNED, tmp_path / "taken")
+    with pytest.raises(PolicyFileRefused, match="cannot be written: "):
+        save_policy(LEARNED, "")
     assert [each.name for each in tmp_path.iterdir()] == ["taken"]
 
 
