@@ -188,11 +188,14 @@ class Recall:
                 situation that `has` and `near` give.
             has, near: of a type only, the words that a try must have, and the numbers, as in the call.
 
-        Raises `CallerError` for features that no action of the type has, and for those of a designator.
+        Raises `CallerError` for what is no action, for features that no action of the type has, and for those of a
+        designator.
         """
         if not isinstance(action, str | type):
             if has or near:
                 raise errors.CallerError("`has` and `near` belong to a type; an action has a situation of its own")
+            if not isinstance(action, ActionDescription | Designator):
+                raise errors.CallerError(f"{search.shortened(action)} is no action: give one, or a type of actions")
             first: Any = action.resolve() if isinstance(action, ActionDescription) else action
             return (await self.predictions([await first if isawaitable(first) else first]))[0]
         dtype = dtype_of(action)

@@ -308,6 +308,12 @@ async def test_parallel_plans_are_all_advised_and_one_that_outlives_the_advice_e
             assert levels_of(tree) == [0.5, 0.5, 0.5]
 
 
+async def test_what_is_no_action_is_not_predicted() -> None:
+    async with Memory.open("sqlite://") as memory:
+        with pytest.raises(CallerError, match="3 is no action: give one"):
+            await memory.predict(3)  # type: ignore[arg-type]
+
+
 def test_a_minimum_is_a_chance() -> None:
     with (
         pytest.raises(CallerError, match="minimum must be a chance from 0 to 1, got 30"),
