@@ -158,8 +158,12 @@ def learn(
     DatabaseAddress.parse(place.url)
     _check_files(policy, figure)
     if from_memory:
-        if resume or study_rollouts or episode_each or collisions:
-            raise CallerError("--from-memory tries nothing: leave out --resume, --study, --episode-each, --collisions")
+        of_rollouts = resume or study_rollouts or episode_each or collisions or limits is not Limits.SOFT
+        if of_rollouts or rounds > 1 or explore or heights or cluster:
+            raise CallerError(
+                "--from-memory tries nothing: leave out --rounds, --explore, --heights, --limits, --collisions,"
+                " --cluster, --episode-each, --resume, --study"
+            )
         kind = model or Learned.SUCCESS
         leaf = LEAVES[kind] if min_samples_leaf is None else min_samples_leaf
         _learn_from_memory(_conditions(where or []), policy, place, kind, leaf, as_json=as_json)

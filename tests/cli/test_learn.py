@@ -98,6 +98,8 @@ def test_a_policy_is_learned_from_one_kind_of_what_is_remembered(document: Any, 
         (("--where", "thing=milk"), "pick-ups have no column 'thing' to choose by"),
         (("--where", "object=BOWL"), "no pick-up is remembered that succeeded or failed, with object BOWL"),
         (("--resume",), "--from-memory tries nothing"),
+        (("--explore", "random"), "--from-memory tries nothing"),
+        (("--heights", "0.6", "1.2"), "--from-memory tries nothing"),
     ):
         refused = pycrorm("learn", "--from-memory", *arguments, cwd=tmp_path)
         assert message in one_line_of(refused)
