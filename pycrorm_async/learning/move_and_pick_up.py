@@ -331,9 +331,13 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     @property
     def height(self) -> float:
-        """Height of the object over the lifted torso at this moment, m. Raises `NoWorld`, `NoRobotHere`."""
+        """Height of the object over the lifted torso, if there is one, else over the base, now, m.
+
+        Raises `NoWorld`, `NoRobotHere`.
+        """
         robot = objects.require_robot()
-        torso = robot.body.joint_position(robot.torso_joint())
+        joint = robot.description.torso_joint
+        torso = 0.0 if joint is None else robot.body.joint_position(joint)
         return self.target.pose.position.z - robot.body.pose.position.z - torso
 
     def policy_here(self) -> Policy:

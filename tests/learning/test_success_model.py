@@ -43,9 +43,9 @@ from pycrorm_async.learning.features import FEATURES, features_of, features_of_f
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.success_model import CONFIDENT, Tree
-from pycrorm_async.plan import Retry
+from pycrorm_async.plan import Retry, simulated_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
-from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.learning.geometric_rollouts import succeeds
 
@@ -356,6 +356,15 @@ def test_the_likeliest_of_many_ways_come_first_each_with_its_probability(stage: 
         next(MoveAndPickUp(stage.target, policy=NEAR_AND_LOW).from_mode())
 
 
+def test_a_robot_without_a_torso_has_ways_at_the_height_over_its_base() -> None:
+    with BulletWorld(), simulated_robot:
+        Object("courier", ObjectType.ROBOT)
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.6]))
+        tries = MoveAndPickUp(milk, policy=SuccessModel.untrained(), samples=3)
+        assert tries.height == pytest.approx(0.6)
+        assert [each.torso for each in tries if isinstance(each, PredictedPickUpPerformable)] == [None] * 3
+
+
 def test_a_model_of_another_robot_is_refused(stage: Stage) -> None:
     other = SuccessModel("grasp-polar", 1, 0.0, (), "courier", 100, 40)
     with pytest.raises(CallerError, match="was fitted to pick-ups of courier, this robot is pr2: pass a model"):
@@ -419,6 +428,7 @@ async def test_interrupted_rounds_continue_to_the_model_of_rounds_without_an_int
     whole = await run(replace(ROUNDS, workers=2), MemoryLocation(f"sqlite:///{tmp_path}/whole.db", tmp_path / "whole"))
     assert isinstance(whole.policy, SuccessModel)
     assert (whole.policy.rollouts, whole.policy.successes) == (300, len(whole.successes))
+    assert whole.policy.robot == "pr2"  # so that another robot refuses the model
     default, second, evaluation, held_out = whole.phases
     assert default.policy == held_out.policy == name_of(SuccessModel.untrained())
     assert default.tally.success_rate < 0.35 < second.tally.success_rate
