@@ -23,7 +23,7 @@ from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.projections.rebuild import claimed
 from pycrorm_async.store.address import shared_address
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.lake import ATTEMPTS, Lake, LakeEpisode, digest_after
+from pycrorm_async.store.lake import ATTEMPTS, Lake, LakeEpisode, check_present, digest_after, shown
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode, RunningDigest, Span, StoredEvent
 
@@ -52,7 +52,8 @@ async def archive_episodes(
     With `only`, those among them with one of these numbers.
 
     Leaves out episodes that are stopped or not visible yet. Raises `CallerError` while another archive or rebuild of
-    the memory runs, `MissingExtra`, and errors of both databases; what was moved until then stays moved.
+    the memory runs, `MissingExtra`, and errors of both databases, also for a lake that has episodes of this memory and
+    is missing; what was moved until then stays moved.
     """
     log = await EventLog.open(shared_address(url), create=False)
     await log.close()
@@ -60,6 +61,8 @@ async def archive_episodes(
     summary = ArchiveSummary([], {})
     try:
         async with claimed(log):
+            if any(each.archived_in == shown(address) for each in await log.all_removed()):
+                check_present(address)
             lake = Lake(address, write=True)
             try:
                 end_ns = before.timestamp() * 1e9

@@ -116,6 +116,15 @@ def open_lake(address: str, *, write: bool = False) -> Any:
     raise DatabaseForeign(f"{shown(address)} {fault}")
 
 
+def check_present(address: str) -> None:
+    """Raise `DatabaseUnavailable` if the folder of a lake that was made is away: a new one would be below its mount."""
+    catalog, place, data = _parsed(address)
+    for each in ([place] if catalog == "sqlite" else []) + ([data] if data and "://" not in data else []):
+        if not Path(each).exists():
+            has = "has episodes of this memory, and is away"
+            raise DatabaseUnavailable(f"{shown(address)} {has}: mount {each}, or name another lake")
+
+
 def _parsed(address: str) -> tuple[str, str, str]:
     """Return the kind of the catalog, its place, and the folder of the data. Raises `CallerError`."""
     place, _, data = address.removeprefix(PREFIX).partition("#")

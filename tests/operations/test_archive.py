@@ -325,6 +325,21 @@ async def test_a_lake_takes_no_episode_again_that_was_erased_from_it(tmp_path: P
     assert query_lake(lake, "SELECT (SELECT count(*) FROM event), (SELECT count(*) FROM episode)")[1] == [(0, 0)]
 
 
+async def test_a_lake_that_has_episodes_and_is_away_is_not_made_anew(tmp_path: Path, lake: str) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await recorded(url, "archived")
+    assert len((await archived(url, lake)).removed) == 1
+    await recorded(url, "later")
+    (tmp_path / "lake").rename(tmp_path / "away")
+    with pytest.raises(DatabaseUnavailable, match="has episodes of this memory, and is away"):
+        await archived(url, lake)
+    assert ask(url, "SELECT number FROM episode") == [(2,)]
+    assert not (tmp_path / "lake").exists()
+    (tmp_path / "away").rename(tmp_path / "lake")
+    await archived(url, lake)
+    assert query_lake(lake, "SELECT count(*) FROM episode")[1] == [(2,)]
+
+
 async def test_an_episode_that_differs_from_the_lake_stays_in_the_memory(tmp_path: Path, lake: str) -> None:
     url, other = put_memory(tmp_path / "memory.db"), put_memory(tmp_path / "other.db")
     await notes(url, "a")
