@@ -663,13 +663,11 @@ class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
                 yield self._performable_of(recalled, "recall", expected=way.score)
         for description, chosen_by in self._otherwise:
             try:
-                moves = list(description)
-            except ObjectUnreachable:
+                for move in description:
+                    yield self._performable_of(move, chosen_by)
+            except ObjectUnreachable:  # a learned policy may know no way at this height
                 if description is self._default:
                     raise
-                continue  # a learned policy may know no way at this height
-            for move in moves:
-                yield self._performable_of(move, chosen_by)
 
     async def _best(
         self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]

@@ -48,7 +48,8 @@ class TransportPolicy:
 
     Args:
         policy: a success model or a learned policy; None prefers nothing: random places and heights of the torso.
-        recall: fetch first in the ways that succeeded before, by the open memory (`RecalledPickUp`).
+        recall: fetch first in the ways that succeeded before, by the open memory, then in those of the policy
+            (`RecalledPickUp`).
         checked: leave out ways that kinematics, or where collisions count a collision, forbids. Without it the
             experience alone decides.
         rng: random generator of the proposals; None means a new one with an unpredictable seed.
@@ -82,8 +83,8 @@ class TransportPolicy:
             return self.placing_chance(target, arm, grasp, goal)
 
         if self._recalls:
-            remembered = self.policy if isinstance(self.policy, Policy) else None
-            async for way in RecalledPickUp(target, arms, policy=remembered, samples=PROPOSALS, rng=self._rng):
+            otherwise = self.policy if self.policy != SuccessModel.untrained() else None
+            async for way in RecalledPickUp(target, arms, policy=otherwise, samples=PROPOSALS, rng=self._rng):
                 if placeable(way.arm, way.grasp) and self.reaches(way):
                     yield way
             return

@@ -14,7 +14,7 @@ from sqlalchemy import select
 from bench import tasks
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.learning import Disturbance, TransportPolicy
+from pycrorm_async.learning import Disturbance, SuccessModel, TransportPolicy, name_of
 from pycrorm_async.learning.transport import held_grasp
 from pycrorm_async.orm import TransportAction as TransportRow
 from pycrorm_async.plan import (
@@ -94,6 +94,15 @@ async def test_a_policy_is_asked_with_async_for_and_says_so() -> None:
             await Retry(TransportAction(thing, ARMS, [Pose((0, 0, 3))], policy=policy()), max_tries=2).perform()
         with pytest.raises(ReachabilityFailure, match="no place to stand and place"):
             policy().placing(thing, Arms.LEFT, Pose((0, 0, 3))).resolve()
+
+
+async def test_where_nothing_is_remembered_recall_is_followed_by_the_model() -> None:
+    model = SuccessModel("grasp-polar", 1, 1.0, (), None, 100, 40)
+    async with Memory.open("sqlite://"):
+        with tasks.kitchen(Disturbance()) as here:
+            thing, goal = here.prepare(69, 4)
+            way = await anext(TransportPolicy(model, recall=True).fetching(thing, ARMS, goal))
+    assert way.policy == name_of(model)
 
 
 async def test_the_grasp_of_a_held_object_is_known_from_the_hand() -> None:
