@@ -224,7 +224,8 @@ def _conditions(where: list[str]) -> dict[str, str]:
         column, sign, text = each.partition("=")
         if not sign:
             raise CallerError(f"--where {each[:60]!r} is not a condition: write COLUMN=TEXT, as object=MILK")
-        conditions[column] = text
+        if conditions.setdefault(column, text) != text:
+            raise CallerError(f"--where {column} is given twice, but no pick-up has both values: choose one")
     return conditions
 
 

@@ -95,6 +95,7 @@ def test_a_policy_is_learned_from_one_kind_of_what_is_remembered(document: Any, 
     assert answer("policy", card["summary"]["name"], cwd=tmp_path) == card
     for arguments, message in (
         (("--where", "kind"), "is not a condition: write COLUMN=TEXT"),
+        (("--where", "arm=LEFT", "--where", "arm=RIGHT"), "--where arm is given twice"),
         (("--where", "thing=milk"), "pick-ups have no column 'thing' to choose by"),
         (("--where", "object=BOWL"), "no pick-up is remembered that succeeded or failed, with object BOWL"),
         (("--resume",), "--from-memory tries nothing"),
