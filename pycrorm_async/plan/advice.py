@@ -7,7 +7,6 @@ adviser does not allow. Where the adviser has no answer, the alternatives keep t
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Sequence
 from contextlib import aclosing
 from contextvars import ContextVar
@@ -89,6 +88,16 @@ async def _parts(description: Iterable[Any] | AsyncIterable[Any]) -> AsyncGenera
         async for each in description:
             yield [each]
         return
-    alternatives = iter(description)
-    while part := [*itertools.islice(alternatives, ALTERNATIVES_MAX)]:
+    part: list[Any] = []
+    try:
+        for each in description:
+            part.append(each)
+            if len(part) == ALTERNATIVES_MAX:
+                yield part
+                part = []
+    except Exception:
+        if part:
+            yield part  # what comes before the failure is tried first, as without advice
+        raise
+    if part:
         yield part

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -306,6 +306,21 @@ async def test_parallel_plans_are_all_advised_and_one_that_outlives_the_advice_e
                 await asyncio.sleep(0)
             await outliving
             assert levels_of(tree) == [0.5, 0.5, 0.5]
+
+
+async def test_alternatives_before_the_failure_of_a_description_are_tried() -> None:
+    class Failing(GripSliding):
+        def __iter__(self) -> Iterator[GripSlidingActionPerformable]:
+            yield from super().__iter__()
+            raise PlanFailure("there is no further way")
+
+    async with Memory.open("sqlite://") as memory, memory.episode(description="failing"):
+        with memory.advising():
+            with collected_tree() as tree:
+                await Retry(Failing([0.5])).perform()
+            with pytest.raises(PlanFailure, match="there is no further way"):
+                await Retry(Failing([1.5]), max_tries=2).perform()
+        assert levels_of(tree) == [0.5]
 
 
 async def test_what_is_no_action_is_not_predicted() -> None:
