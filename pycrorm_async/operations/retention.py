@@ -21,6 +21,7 @@ from sqlalchemy import ColumnClause, column, select, table
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.operations.removal import ErasedEpisode, erase
 from pycrorm_async.progress_bar import ProgressCallback
@@ -102,18 +103,17 @@ async def add_rule(
 ) -> RetentionRule:
     """Store a rule, which replaces that of the same tags; `age` None keeps for ever.
 
-    Raises `CallerError` for a rule that keeps for ever and archives.
+    Raises `CallerError` for a rule that keeps for ever and archives, and for a tag that no episode can have.
     """
     if age is None and archive_to is not None:
         raise CallerError("--keep forever leaves nothing to archive: leave out --archive-to")
-    keep_s = None if age is None else int(age.total_seconds())
+    keep_s, named = None if age is None else int(age.total_seconds()), tuple(sorted(checked_tags(tags)))
     with log.translated():
         async with log.writing() as connection:
             dialect = dialect_of(connection)
             await dialect.lock_log_changes(connection)
             await dialect.create_if_missing(connection, schema.RETENTION)
             numbers = {each.tags: each.number for each in await _rules(connection)}
-            named = tuple(sorted({*tags}))
             number = numbers.get(named, 1 + max(numbers.values(), default=0))
             rule = RetentionRule(number, keep, keep_s, named, archive_to)
             stored = (number, keep, keep_s, json.dumps(named), archive_to)

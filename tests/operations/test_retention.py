@@ -201,6 +201,7 @@ async def test_the_command_lists_tries_asks_and_applies(tmp_path: Path) -> None:
     assert "is not an age: write 12h, 90d, 52w, 1y, or forever" in run("add", "--keep", "2026-01-01", code=2)
     assert "nothing to archive" in run("add", "--keep", "forever", "--archive-to", "ducklake:lake", code=2)
     assert "a lake is named ducklake:FOLDER" in run("add", "--keep", "1y", "--archive-to", "lake", code=2)
+    assert "a tag must be a text of 1 to 100 characters" in run("add", "--keep", "1d", "--tag", "", code=2)
     run("add", "--keep", "30d")
     run("add", "--keep", "1y", "--tag", "demo", "--archive-to", "ducklake:lake")
     rules = json.loads(run("list", "--json"))
