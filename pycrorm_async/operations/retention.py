@@ -144,8 +144,7 @@ async def due_episodes(log: EventLog, rules: Sequence[RetentionRule], now_ns: in
     tags_by_number = await _tags_in_tables(log, {tag for each in rules for tag in each.tags})
     due: list[DueEpisode] = []
     for row in await log.episodes():
-        folded = () if tags_by_number is None else tags_by_number.get(row.number, ())
-        if tags_by_number is None or _rule_that_ended(rules, folded, row, now_ns) is not None:
+        if tags_by_number is None or _rule_that_ended(rules, tags_by_number.get(row.number, ()), row, now_ns):
             tags = await tags_of(log, row)
             rule = _rule_that_ended(rules, tags, row, now_ns)
             if rule is not None:

@@ -535,8 +535,6 @@ async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequenc
 # robots with an episode a minute for four years, a week of a hundred events a second). From nine tenths of a limit on,
 # `status` warns and the process that stores the events logs one line, so that a user has time to act.
 
-EPISODES_MANY = EPISODE_NUMBER_MAX * 9 // 10 + 1
-"""Episode number from which a memory counts as nearly full: 1,932,735,283, nine tenths of the limit."""
 _MOVE = "move its spool to a new memory with `pycrorm spool rebind`"
 
 EVENTS_MANY = SEQUENCE_MAX * 9 // 10 + 1

@@ -119,10 +119,10 @@ def open_lake(address: str, *, write: bool = False) -> Any:
 def check_present(address: str) -> None:
     """Raise `DatabaseUnavailable` if the folder of a lake that was made is away: a new one would be below its mount."""
     catalog, place, data = _parsed(address)
-    for each in ([place] if catalog == "sqlite" else []) + ([data] if data and "://" not in data else []):
-        if not Path(each).exists():
-            has = "has episodes of this memory, and is away"
-            raise DatabaseUnavailable(f"{shown(address)} {has}: mount {each}, or name another lake")
+    for each in (place if catalog == "sqlite" else "", "" if "://" in data else data):
+        if each and not Path(each).exists():
+            advice = f"is away: mount {each}, or name another lake"
+            raise DatabaseUnavailable(f"{shown(address)} has episodes of this memory, and {advice}")
 
 
 def _parsed(address: str) -> tuple[str, str, str]:

@@ -11,9 +11,10 @@ from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import Record
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.store import schema, sqlite
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.append import EPISODES_MANY, EVENTS_MANY
+from pycrorm_async.store.append import EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite_engine import StoppableConnection
@@ -93,7 +94,7 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
 async def test_a_memory_and_an_open_episode_near_their_limits_are_named(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(2), 1, 2, position=3)])
     assert await log.limits_near() == []
-    await log.store([record(episode(3), 1)], numbers={episode(3): EPISODES_MANY})
+    await log.store([record(episode(3), 1)], numbers={episode(3): EPISODE_NUMBER_MAX * 9 // 10 + 1})
     ask_to_change(database_url, f"UPDATE episode SET head = {EVENTS_MANY} WHERE number = 1")
     numbers, events = await log.limits_near()
     assert numbers.startswith("1,932,735,283 of 2,147,483,647 episode numbers are used")
