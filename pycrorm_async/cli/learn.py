@@ -19,7 +19,7 @@ import typer
 
 from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import JsonOption, note, print_facts, print_json, print_table
-from pycrorm_async.cli.policy import print_card
+from pycrorm_async.cli.policy import percent, print_card
 from pycrorm_async.cli.reading import DEFAULT_URL, Place, ReadingPlace
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
@@ -165,7 +165,7 @@ def learn(
                 " --cluster, --episode-each, --resume, --study"
             )
         kind = model or Learned.SUCCESS
-        leaf = LEAVES[kind] if min_samples_leaf is None else min_samples_leaf
+        leaf = min_samples_leaf or LEAVES[kind]
         _learn_from_memory(_conditions(where or []), policy, place, kind, leaf, as_json=as_json)
         return
     if where:
@@ -323,14 +323,8 @@ def _print(learned: ExperimentResult, in_kitchen: KitchenResult, studied: Study 
             for each in learned.phases
         ],
     )
-    print_facts(
-        "Learned",
-        {
-            "from": _size(learned),
-            "coverage": _coverage(learned),
-            "kitchen": _kitchen(in_kitchen),
-        },
-    )
+    facts = {"from": _size(learned), "coverage": _coverage(learned), "kitchen": _kitchen(in_kitchen)}
+    print_facts("Learned", facts)
     if studied is not None:
         _print_study(studied)
 
@@ -340,7 +334,7 @@ def _print_study(studied: Study) -> None:
         "Policies learned from fewer rollouts",
         ("rollouts", "successes", "succeeded", "95 % interval", "coverage"),
         [
-            (each.rollouts, each.successes, _percent(each.tally), _interval(each.tally), _share(each.coverage))
+            (each.rollouts, each.successes, _percent(each.tally), _interval(each.tally), percent(each.coverage))
             for each in studied.curve
         ],
     )
@@ -381,10 +375,6 @@ def _coverage(learned: ExperimentResult) -> str:
     if learned.coverage is None:
         return "unknown, because no held-out rollout succeeded; run again with a larger --held-out and --resume"
     return f"{learned.coverage:.1%} of the held-out successes are possible under the learned policy"
-
-
-def _share(coverage: float | None) -> str:
-    return "" if coverage is None else f"{coverage:.1%}"
 
 
 def _percent(tally: Tally) -> str:

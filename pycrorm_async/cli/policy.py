@@ -66,8 +66,8 @@ def print_card(card: PolicyCard) -> None:
     if evaluation is not None:
         facts["from"] = evaluation.experience
         facts["failures"] = evaluation.failures
-        facts["coverage"] = _percent(evaluation.coverage)
-        facts["ceiling"] = _percent(evaluation.ceiling)
+        facts["coverage"] = percent(evaluation.coverage)
+        facts["ceiling"] = percent(evaluation.ceiling)
     print_facts(f"Policy {summary.name}", facts)
     if card.trainings:
         print_table(
@@ -105,7 +105,7 @@ def _held_out(each: HeldOut) -> tuple[object, ...]:
     confident = _of(each.confident_successes, each.confident)
     return (
         each.by, each.groups, each.tries, _of(each.successes, each.tries), each.confident, confident,
-        _percent(each.coverage), each.brier,
+        percent(each.coverage), each.brier,
     )  # fmt: skip
 
 
@@ -120,5 +120,5 @@ def _of(successes: int, tries: int) -> str:
     return str(Share.of(successes, tries))
 
 
-def _percent(share: float | None) -> str:
+def percent(share: float | None) -> str:
     return "" if share is None else f"{share:.1%}"

@@ -394,7 +394,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             return clearance is None or self.is_clear(choice, clearance)
 
         if isinstance(self._model, SuccessModel):
-            proposals = self._lifted(self.policy_here().sample(rng, DRAWN_FROM), rng, context)
+            proposals = self.lifted(self.policy_here().sample(rng, DRAWN_FROM), rng, context)
             choice = self._model.draw(rng, proposals, context, possible)
         else:
             [choice] = self._polar_ways(self._model, rng, 1, context, self.policy_here())
@@ -427,7 +427,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         if isinstance(model, PolarPolicy):
             proposals = self._polar_ways(model, self._rng, count, context, policy)
             return proposals, model.likelihood(proposals, context)
-        choices = self._lifted(policy.sample(self._rng, count), self._rng, context)
+        choices = self.lifted(policy.sample(self._rng, count), self._rng, context)
         return choices, model.probability(choices, context)
 
     def way(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
@@ -461,7 +461,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             raise ObjectUnreachable(message, self.target.name) from impossible
 
     @staticmethod
-    def _lifted(
+    def lifted(
         choices: Sequence[PickUpChoice], rng: np.random.Generator, context: PickUpContext
     ) -> Sequence[PickUpChoice]:
         """Return the choices, each with a random height of the torso, if there is one to lift."""
@@ -651,10 +651,8 @@ class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
         """Yield the way with the highest expected success that was not yielded yet, then the policy's samples."""
         source = self._experience if self._experience is not None else experience.get()
         if source is not None:
-            region, clearance = (
-                free_and_visible(objects.require_robot(), objects.in_world(self.target)),
-                base_clearance(),
-            )
+            region = free_and_visible(objects.require_robot(), objects.in_world(self.target))
+            clearance = base_clearance()
             tried: set[PickUpChoice] = set()
             while (best := await self._best(source, region, clearance, tried)) is not None:
                 choice, way = best

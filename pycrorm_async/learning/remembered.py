@@ -39,6 +39,7 @@ from pycrorm_async.learning.experiment import Learned, choices_of
 from pycrorm_async.learning.features import features_of_frame
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import Floats, Policy
+from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import CalibrationBin, Evaluation, HeldOut, record_policy
 from pycrorm_async.learning.success_model import CONFIDENT, SuccessModel
@@ -64,7 +65,6 @@ COLUMNS: Final = "robot object arm grasp policy description scene kind".split()
 """The columns that `select_tries` takes."""
 _OWN_WORLD: Final = "BulletWorld ("
 """The begin of the description of a world of this package."""
-_BAND_M: Final = 0.1
 _BINS: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
@@ -230,7 +230,7 @@ def _groups(tries: pd.DataFrame) -> Iterator[tuple[str, int, NDArray[np.int64]]]
     """Yield the properties in which the tries differ, each with the number of values and the fold of each try."""
     yield "random", len(tries), np.random.default_rng(0).permutation(len(tries)) % FOLDS
     heights = tries["height"] + tries["torso_height"].fillna(0.0)
-    bands = np.floor(heights / _BAND_M + 1e-6)
+    bands = np.floor(heights / BAND_M + 1e-6)
     columns = {"seed": tries["seed"], "height": bands, "object": tries["object"], "scene": tries["scene"]}
     for name, values in columns.items():
         known = sorted(set(values.dropna()))

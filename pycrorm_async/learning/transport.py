@@ -168,7 +168,7 @@ class TransportPolicy:
 
     def _proposals(
         self, robot: objects.CurrentRobot, arm: Arms, grasp: Grasp, goal: Pose, context: PickUpContext
-    ) -> list[PickUpChoice]:
+    ) -> Sequence[PickUpChoice]:
         """Return choices of the default policy around the goal, at free places, each with a height of the torso."""
         ground = Pose((goal.position.x, goal.position.y, 0.0))
         clearance = locations.base_clearance()
@@ -180,10 +180,7 @@ class TransportPolicy:
         evidence = Evidence(frozenset({arm}), frozenset({grasp}))
         drawn = default_policy().condition(evidence).sample(self._rng, 2 * PROPOSALS)
         choices = [each for each in drawn if free.value_at(*_place(goal, each).position[:2]) > 0][:PROPOSALS]
-        if context.torso_limits is None:
-            return choices
-        torsos = self._rng.uniform(*context.torso_limits, len(choices)).tolist()
-        return [each._replace(torso=torso) for each, torso in zip(choices, torsos, strict=True)]
+        return MoveAndPickUp.lifted(choices, self._rng, context)
 
     def _chances(self, choices: Sequence[PickUpChoice], context: PickUpContext) -> Floats:
         """Return the chance of each choice: a model's probability, of a policy its density relative to the highest."""

@@ -375,18 +375,14 @@ class MemoryAdviser:
     ) -> None:
         self._predict = predict
         self._observe = observe
-        self._minimum = minimum
+        self.minimum = minimum
         self._explore = explore
         self._late: set[asyncio.Task[Sequence[Prediction]]] = set()  # questions that no plan waits for any longer
         self._has_failed = False
 
-    @property
-    def minimum(self) -> float:
-        return self._minimum
-
     def allows(self, chance: Chance) -> bool:
         is_known = (chance.low, chance.high) != _UNKNOWN
-        return chance.chance >= self._minimum if is_known else self._explore
+        return chance.chance >= self.minimum if is_known else self._explore
 
     async def chances(self, alternatives: Sequence[Designator]) -> Sequence[Prediction] | None:
         if not all(each.done() for each in self._late):
