@@ -339,8 +339,10 @@ def test_a_minimum_is_a_chance() -> None:
 
 @pytest.mark.slow
 async def test_in_the_kitchen_advice_saves_failed_attempts_and_loses_no_object_postgresql_as_sqlite(
-    server: Server, tmp_path: Path
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)  # the default spool of a database of PostgreSQL is in the working directory
+
     async def outcome(way: str, url: str) -> advised.Outcome:
         tasks = advised.Outcome()
         await advised.remember(url, seed=0, tries=60)
