@@ -95,6 +95,7 @@ def open_lake(address: str, *, write: bool = False) -> Any:
         raise DatabaseUnavailable(f"{address}: there is no lake: `pycrorm archive --to {address}` makes one")
     options = ["DATA_INLINING_ROW_LIMIT 0", *([f"DATA_PATH '{_quoted(data)}'"] if data else [])]
     options += [] if write else ["READ_ONLY"]
+    options += ["META_BUSY_TIMEOUT 30000"] if catalog == "sqlite" else []  # ms; other archives commit meanwhile
     attach = f"ATTACH 'ducklake:{catalog}:{_quoted(place)}' AS lake ({', '.join(options)}); USE lake"
     for attempt in range(1, ATTEMPTS + 1):
         connection = _connect("ducklake", f"{catalog}_scanner")
