@@ -52,10 +52,13 @@ from pycrorm_async.world.urdf import Limits
 
 LEAVES = {Learned.PLACES: 25, Learned.POLAR: 20, Learned.SUCCESS: 10}
 """The rows in a leaf, unless others are chosen."""
+_FROM_MEMORY = ("--from-memory", "--where", "--model", "--min-samples-leaf", "--policy", "--url", "--spool", "--json")
+"""The options that mean something with --from-memory."""
 _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def learn(
+    context: typer.Context,
     *,
     rollouts: Annotated[int, typer.Option(min=1, help="Rollouts to learn from in each round.")] = 5_000,
     rounds: Annotated[
@@ -157,19 +160,18 @@ def learn(
     # that of the packages comes last, because importing them takes half a second.
     DatabaseAddress.parse(place.url)
     _check_files(policy, figure)
+    options = _given_options(context)
     if from_memory:
-        of_rollouts = resume or study_rollouts or episode_each or collisions or limits is not Limits.SOFT
-        if of_rollouts or rounds > 1 or explore or heights or cluster:
-            raise CallerError(
-                "--from-memory tries nothing: leave out --rounds, --explore, --heights, --limits, --collisions,"
-                " --cluster, --episode-each, --resume, --study"
-            )
+        if of_rollouts := [each for each in options if each not in _FROM_MEMORY]:
+            raise CallerError(f"--from-memory tries nothing: leave out {', '.join(of_rollouts)}")
         kind = model or Learned.SUCCESS
         leaf = min_samples_leaf or LEAVES[kind]
         _learn_from_memory(_conditions(where or []), policy, place, kind, leaf, as_json=as_json)
         return
     if where:
         raise CallerError("--where belongs to --from-memory")
+    if cluster is not None and "--workers" in options:
+        raise CallerError("--cluster performs the rollouts in its own workers: leave out --workers")
     model = model or Learned.PLACES
     if explore is not None and model is not Learned.SUCCESS:
         raise CallerError(f"--explore {explore} needs --model success: other policies try as they act")
@@ -215,6 +217,12 @@ def learn(
     _print(learned, in_kitchen, studied)
     option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(place.address.to_type)}"
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
+
+
+def _given_options(context: typer.Context) -> list[str]:
+    """Return the options that the command's line sets."""
+    sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in context.command.params}
+    return [option for option, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
 
 
 def _conditions(where: list[str]) -> dict[str, str]:

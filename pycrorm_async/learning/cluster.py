@@ -112,7 +112,6 @@ class ClusterWorkers:
         """
         try:
             self._client = await self._stack.enter_async_context(_connected(self._cluster))
-            await self._check_versions()
             if self._place is not None:
                 address = shared_address(self._place.url)
                 spool = (self._place.spool or address.default_spool).absolute()
@@ -127,24 +126,6 @@ class ClusterWorkers:
 
     async def __aexit__(self, *_: object) -> None:
         await self._stack.aclose()
-
-    async def _check_versions(self) -> None:
-        try:
-            await self._client.wait_for_workers(1, timeout=_CONNECT_S)
-        except TimeoutError:
-            raise CallerError(
-                f"the scheduler at {self._cluster} has no workers: start `dask worker {self._cluster} --nworkers -1"
-                " --nthreads 2` on each machine"
-            ) from None
-        # A function of the standard library, because the workers may not have this package.
-        name = "pycrorm_async:__version__"
-        versions = await self._client.run(pkgutil.resolve_name, name, on_error="return")
-        for worker, version in versions.items():
-            if version != __version__:
-                fault = f"has version {version}"
-                if isinstance(version, Exception):
-                    fault = f"cannot import the package ({version})"
-                raise CallerError(f"the worker {worker} {fault}: install version {__version__} there, as here")
 
     async def roll_out(
         self, job: RolloutTask, runs: Iterable[tuple[int, int]], report: Callable[[Tally], None] = lambda _: None
@@ -218,7 +199,10 @@ def _divided(runs: Iterable[tuple[int, int]], length_max: int) -> Iterator[tuple
 
 @asynccontextmanager
 async def _connected(cluster: str) -> AsyncIterator[Client]:
-    """Yield a client of this scheduler. Raises `MissingExtra`, and `CallerError` if it does not answer."""
+    """Yield a client of this scheduler.
+
+    Raises `MissingExtra`, and `CallerError` if no scheduler or worker answers, or a worker has another version.
+    """
     try:
         from distributed import Client
     except ImportError:
@@ -231,7 +215,32 @@ async def _connected(cluster: str) -> AsyncIterator[Client]:
         await client.close()
         raise CallerError(f"no Dask scheduler answers at {cluster}: {error}") from None
     async with client:
+        await _check_workers(client, cluster)
         yield client
+
+
+async def _check_workers(client: Client, cluster: str) -> None:
+    try:
+        await client.wait_for_workers(1, timeout=_CONNECT_S)
+    except TimeoutError:
+        raise CallerError(
+            f"the scheduler at {cluster} has no workers: start `dask worker {cluster} --nworkers -1 --nthreads 2` on"
+            " each machine"
+        ) from None
+    # A function of the standard library, because the workers may not have this package.
+    versions = await client.run(pkgutil.resolve_name, "pycrorm_async:__version__", on_error="return")
+    for worker, version in versions.items():
+        if version != __version__:
+            fault = f"has version {version}"
+            if isinstance(version, Exception):
+                fault = f"cannot import the package ({version})"
+            raise CallerError(f"the worker {worker} {fault}: install version {__version__} there, as here")
+
+
+async def check_cluster(cluster: str) -> None:
+    """Check that rollouts can be performed there. Raises what `ClusterWorkers.__aenter__` raises."""
+    async with _connected(cluster):
+        pass
 
 
 # --- in the worker --------------------------------------------------------------------------------------------

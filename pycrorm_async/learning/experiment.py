@@ -23,7 +23,7 @@ from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
-from pycrorm_async.learning.cluster import RolloutPool, rollout_pool
+from pycrorm_async.learning.cluster import RolloutPool, check_cluster, rollout_pool
 from pycrorm_async.learning.features import PickUpContext
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.polar_policy import PolarPolicy
@@ -290,13 +290,16 @@ async def run(
     """Run the experiment; with `resume`, only its missing rollouts.
 
     Raises:
-        CallerError: rollouts of this experiment are recorded already and `resume` is False.
+        CallerError: rollouts of this experiment are recorded already and `resume` is False; or the cluster does not
+            answer.
         NotEnoughExperience: too few rollouts succeeded to learn from; all are recorded.
         WorkerLost: a worker process died; its finished rollouts are recorded.
         InternalError: the memory and the workers' counts differ.
     """
     import pandas as pd
 
+    if experiment.cluster is not None:
+        await check_cluster(experiment.cluster)  # before a database is created for nothing
     # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
     await recover(place.url, spool=place.spool)
     async with (

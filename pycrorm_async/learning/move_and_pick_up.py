@@ -358,9 +358,9 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         )
 
     def _strong_enough(self) -> frozenset[Arms] | None:
-        """Return the allowed arms that lift the object; None if that does not rule one out."""
+        """Return the allowed arms that the robot has and that lift the object; None if that does not rule one out."""
         allowed = ARMS if self.allowed.arms is None else tuple(self.allowed.arms)
-        lifting = lifting_arms(objects.require_robot(), allowed, self.target)
+        lifting = _own_arms(allowed, self.target)
         return frozenset(lifting) if len(lifting) < len(allowed) else None
 
     def _condition(self, evidence: Evidence, where: str) -> Policy:
@@ -565,6 +565,16 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         )
 
 
+def _own_arms(among: Iterable[Arms], target: objects.ObjectLike) -> tuple[Arms, ...]:
+    """Return those of these arms that the robot has and that lift the object.
+
+    Returns all of them if the robot has none, so that the action names the reason.
+    """
+    robot, among = objects.require_robot(), tuple(among)
+    own = [arm for arm in among if arm in robot.description.arms]
+    return lifting_arms(robot, own or among, target)
+
+
 def _around(height: float) -> tuple[float, float]:
     return height - HEIGHT_TOLERANCE_M, height + HEIGHT_TOLERANCE_M
 
@@ -674,7 +684,7 @@ class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
         robot = objects.require_robot()
         torso = robot.body.joint_position(robot.torso_joint()) if robot.description.torso_joint is not None else None
         over_base = self.target.pose.position.z - robot.body.pose.position.z
-        arms = lifting_arms(robot, self._arms, self.target)
+        arms = _own_arms(self._arms, self.target)
         arm = arms[0] if len(arms) == 1 else None
         ways = await source.successes(self.target.object_type, arm=arm, height=over_base, torso=torso)
         places = np.array([each.stand.position[:2] for each in ways]).reshape(-1, 2)

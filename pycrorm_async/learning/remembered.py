@@ -42,7 +42,7 @@ from pycrorm_async.learning.policy import Floats, Policy
 from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import CalibrationBin, Evaluation, HeldOut, record_policy
-from pycrorm_async.learning.success_model import CONFIDENT, SuccessModel
+from pycrorm_async.learning.success_model import CONFIDENT, WITHOUT_HEIGHT, SuccessModel
 from pycrorm_async.learning.tree import learn, learn_polar
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import (
@@ -199,7 +199,10 @@ def learn_remembered(
             case Learned.POLAR:
                 return learn_polar(rows[_succeeded(rows)], min_samples_leaf=min_samples_leaf)
 
-    tries = tries.dropna(subset=["height"]).reset_index(drop=True)
+    with_height = tries.dropna(subset=["height"]).reset_index(drop=True)
+    if with_height.empty:
+        raise NotEnoughExperience(f"all {len(tries):,} pick-ups {WITHOUT_HEIGHT}")
+    tries = with_height
     policy, groups = fit(tries), [*_groups(tries)]
     total, held_out = 1 + sum(folds.max() + 1 for _, _, folds in groups), []
     done = 1

@@ -48,6 +48,10 @@ CONFIDENT: Final = 0.8
 succeed, at 0.5 a fiftieth of its choices would fail."""
 EACH_CLASS_MIN: Final = 20
 """The successes, and also the failures, that a model needs at least: two leaves of its trees take as many rows."""
+WITHOUT_HEIGHT: Final = (
+    "have no height over the robot: its pose, its torso or the pose of the object was not recorded (a robot without a"
+    " torso has one in `MoveAndPickUp.query_with_failures`)"
+)
 _TREES: Final = 150
 _LEAVES_MAX: Final = 31
 _ROWS_AT_ONCE: Final = 4_096
@@ -140,7 +144,7 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
             min_samples_leaf: minimum number of rows in a leaf.
 
         Raises:
-            NotEnoughExperience: fewer than `EACH_CLASS_MIN` successes or failures.
+            NotEnoughExperience: fewer than `EACH_CLASS_MIN` successes or failures with a height.
             CallerError: a column is missing or holds no numbers, or the rows are of several robots.
             MissingExtra: scikit-learn is not installed.
         """
@@ -156,7 +160,7 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
         for kind, count in (("successes", successes), ("failures", len(ended) - successes)):
             if count < EACH_CLASS_MIN:
                 message = f"{count} {kind} are too few to learn from: a success model needs {EACH_CLASS_MIN} successes"
-                raise NotEnoughExperience(f"{message} and as many failures; record more pick-ups")
+                raise NotEnoughExperience(f"{message} and as many failures; {_remedy(tries)}")
         baseline, trees = _fit(features_of_frame(ended), succeeded, min_samples_leaf)
         robot = robots.pop() if robots else None
         name, version = GRASP_POLAR, GRASP_POLAR_VERSION
@@ -221,6 +225,14 @@ def _ended(tries: pd.DataFrame) -> pd.DataFrame:
         raise CallerError("the frame has no column status: select the pick-ups that failed too, with their status")
     ended = tries[tries["status"].isin([TaskStatus.SUCCEEDED.value, TaskStatus.FAILED.value])]
     return ended.dropna(subset=["height"]) if "height" in ended.columns else ended
+
+
+def _remedy(tries: pd.DataFrame) -> str:
+    """Return what to do about too few pick-ups; those without a height are counted."""
+    missing = int(tries["height"].isna().sum()) if "height" in tries.columns else 0
+    if not missing:
+        return "record more pick-ups"
+    return f"{missing:,} of {len(tries):,} pick-ups {WITHOUT_HEIGHT}"
 
 
 class _Forest(NamedTuple):

@@ -29,7 +29,7 @@ from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.success import interval_95
 from pycrorm_async.recall.blocks import EPISODE_SHIFT, CaseLibrary, Group
 from pycrorm_async.recall.columns import Case, Mask, is_angle
-from pycrorm_async.recall.search import Cue, Match, Weights, closest, search, weights_of
+from pycrorm_async.recall.search import Cue, Match, Weights, never_seen, search, weights_of
 from pycrorm_async.visible_text import visible
 
 
@@ -339,7 +339,7 @@ def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -
 def _notes(cue: Cue, library: CaseLibrary) -> Iterator[str]:
     """Yield a line for a type that never occurred, and for each number that is out of the range of its cases."""
     if cue.type is not None and not library.size(cue.type):
-        yield f"never seen: type {cue.type}{closest(cue.type, library.types)}"
+        yield never_seen(cue.type, library)
     for each in cue.near:
         seen = None if is_angle(each.feature) else library.range_of(cue.type, each.feature)
         if seen is not None and not seen[0] <= each.value <= seen[1]:

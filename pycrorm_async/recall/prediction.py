@@ -46,7 +46,7 @@ from pycrorm_async.query.success import interval_95
 from pycrorm_async.recall import cases as case_rows
 from pycrorm_async.recall.blocks import NEAR_M, CaseLibrary, Group
 from pycrorm_async.recall.columns import is_angle
-from pycrorm_async.recall.search import Wanted, dtype_of
+from pycrorm_async.recall.search import Wanted, dtype_of, never_seen
 from pycrorm_async.record.plan_types import built_in_declaration, declared_type
 from pycrorm_async.record.values import Field, pose_value, read_parameters
 from pycrorm_async.world.bullet import BulletWorld, Object, current_world
@@ -77,6 +77,7 @@ class Prediction:
         cases: ids of the task-tree nodes of the tries most like it, the likest first.
         reason: the failure that is most likely if it fails; None if no try like it failed.
         source: `recall`, or the name of the model whose prediction counts as one try.
+        note: about a type of which no case is remembered, with those like it; None for another.
     """
 
     chance: float
@@ -86,6 +87,7 @@ class Prediction:
     cases: tuple[int, ...]
     reason: str | None
     source: str = "recall"
+    note: str | None = None
 
     @property
     def is_known(self) -> bool:
@@ -95,7 +97,7 @@ class Prediction:
     def __str__(self) -> str:
         """Return it as `82 % (61-93 %) from 14.2 tries like it; if it fails, most likely by IKError`."""
         if not self.is_known:
-            return f"not known: {self.tries:.1f} tries like it are not enough"
+            return f"not known: {self.note or f'{self.tries:.1f} tries like it are not enough'}"
         interval = f"{100 * self.chance:.0f} % ({100 * self.low:.0f}-{100 * self.high:.0f} %)"
         fails = f"; if it fails, most likely by {self.reason}" if self.reason else ""
         model = "" if self.source == "recall" else f" and the model {self.source}"
@@ -170,7 +172,8 @@ class _Tries:
         chance, count = (successes + prior) / (evidence + 1), evidence + of_model
         low, high = interval_95(successes + of_model * prior, count) if count >= EVIDENCE_MIN else _UNKNOWN
         source = (situation.model or "a model") if of_model else "recall"
-        return Prediction(chance, min(low, chance), max(high, chance), evidence, cases, reason, source)
+        note = None if library.size(situation.type) else never_seen(situation.type, library)
+        return Prediction(chance, min(low, chance), max(high, chance), evidence, cases, reason, source, note)
 
 
 def _ended(group: Group) -> NDArray[np.bool_]:

@@ -364,6 +364,11 @@ def closest(name: str, valid: Iterable[str]) -> str:
     return question or listed
 
 
+def never_seen(type_: str, library: CaseLibrary) -> str:
+    """Return the line about a type without a case: the types most like it, or else some of those with cases."""
+    return f"never seen: type {type_}{closest(type_, library.types)}"
+
+
 # --- invalid cues ---------------------------------------------------------------------------------------------
 
 

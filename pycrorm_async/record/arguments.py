@@ -104,7 +104,7 @@ class ArgumentReader:
             self.text_of("name", name) or "an object",
             kind,
             pose_of(pose),
-            self.joints_of(joints),
+            self.joints_of(joints, "ObjectAdded"),
             urdf=urdf,
             color=self._color_of(others["color"]),
             mass_kg=mass_kg,
@@ -122,12 +122,13 @@ class ArgumentReader:
         self._missing.note("ObjectAdded", argument, f"it must be a text, not {values.clean_repr(text)}")
         return values.clean_repr(text)
 
-    def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
-        """Copy joint positions. Leave out those that are not finite numbers, and count them as missing, except None."""
+    def joints_of(self, joints: Mapping[str, float], event: str) -> dict[str, float]:
+        """Copy the joint positions of an event of this type.
+
+        Leave out those that are not finite numbers, and count them as missing, except None.
+        """
         if not isinstance(joints, Mapping):
-            self._missing.note(
-                "JointsMoved", "joints", f"they must be positions by name, not {values.clean_repr(joints)}"
-            )
+            self._missing.note(event, "joints", f"they must be positions by name, not {values.clean_repr(joints)}")
             return {}
         copied = dict(joints)
         if _are_plain(copied):  # as nearly all are; the checks below take twenty times as long
@@ -135,12 +136,12 @@ class ArgumentReader:
         positions: dict[str, float] = {}
         for name, position in copied.items():
             text = self.text_of("joint", name)
-            number = self._number_of("joints", position)
+            number = self._number_of("joints", position, event)
             if text is not None and number is not None:
                 positions[text] = number
         return positions
 
-    def _number_of(self, argument: str, number: Any) -> float | None:
+    def _number_of(self, argument: str, number: Any, event: str = "ObjectAdded") -> float | None:
         if number is None:
             return None
         try:
@@ -148,7 +149,7 @@ class ArgumentReader:
                 raise ValueError("it must be a finite number")  # noqa: TRY301  counted below
             return float(number)
         except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
-            self._missing.note("ObjectAdded", argument, f"{values.clean_repr(number)}: {values.message_of(error)}")
+            self._missing.note(event, argument, f"{values.clean_repr(number)}: {values.message_of(error)}")
             return None
 
     def _color_of(self, color: Any) -> tuple[float, float, float, float] | None:

@@ -360,7 +360,7 @@ class RecordedEpisode:
         self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None, at: At | None = None
     ) -> Callable[[], object]:
         """Record new joint positions (rad or m); only those that changed."""
-        copied, writer = self._arguments.joints_of(joints), self._writer
+        copied, writer = self._arguments.joints_of(joints, "JointsMoved"), self._writer
         return self._timed(
             "JointsMoved", at, lambda: writer.objects.turn(writer.known(key), copied, writer.cause(node))
         )

@@ -98,9 +98,9 @@ def test_a_policy_is_learned_from_one_kind_of_what_is_remembered(document: Any, 
         (("--where", "arm=LEFT", "--where", "arm=RIGHT"), "--where arm is given twice"),
         (("--where", "thing=milk"), "pick-ups have no column 'thing' to choose by"),
         (("--where", "object=BOWL"), "no pick-up is remembered that succeeded or failed, with object BOWL"),
-        (("--resume",), "--from-memory tries nothing"),
-        (("--explore", "random"), "--from-memory tries nothing"),
-        (("--heights", "0.6", "1.2"), "--from-memory tries nothing"),
+        (("--resume",), "--from-memory tries nothing: leave out --resume"),
+        (("--seed", "69", "--workers", "2", "--figure", "a.png"), "leave out --seed, --workers, --figure"),
+        (("--heights", "0.6", "1.2"), "--from-memory tries nothing: leave out --heights"),
     ):
         refused = pycrorm("learn", "--from-memory", *arguments, cwd=tmp_path)
         assert message in one_line_of(refused)
@@ -199,7 +199,7 @@ def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) ->
         (("--policy", "x" * 300), 2, "cannot be written"),
         (("--policy", "\udcff.json"), 2, "cannot be written"),
         (("--policy", "both.png", "--figure", "folder.png/../both.png"), 2, "are both both.png"),
-        (("--cluster", "lab"), 2, "no Dask scheduler answers at lab: missing port number"),
+        (("--cluster", "lab:1"), 2, "--cluster performs the rollouts in its own workers: leave out --workers"),
         (("--explore", "random"), 2, "--explore random needs --model success"),
         (("--model", "polar", "--study", "5"), 2, "--study needs --model places, got --model polar"),
         (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
@@ -213,7 +213,13 @@ def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], code:
     done = pycrorm(*BY_ONE, *arguments, cwd=tmp_path)
     assert words in one_line_of(done)
     assert done.returncode == code
-    assert (tmp_path / "pycrorm.db").exists() == ("30" in arguments or "--cluster" in arguments)
+    assert (tmp_path / "pycrorm.db").exists() == ("30" in arguments)
+
+
+def test_a_wrong_cluster_is_refused_before_a_database_is_created(tmp_path: Path) -> None:
+    done = pycrorm(*SMALL, "--cluster", "lab", cwd=tmp_path)
+    assert "no Dask scheduler answers at lab: missing port number" in one_line_of(done)
+    assert (done.returncode, [*tmp_path.iterdir()]) == (2, [])
 
 
 def test_without_the_extra_the_error_names_it(tmp_path: Path) -> None:

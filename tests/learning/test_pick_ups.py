@@ -24,6 +24,7 @@ from pycrorm_async.learning import (
     Rectangle,
     Region,
     Scene,
+    SuccessModel,
     default_policy,
     name_of,
 )
@@ -31,7 +32,7 @@ from pycrorm_async.learning.move_and_pick_up import free_and_visible, rectangles
 from pycrorm_async.learning.policy import AROUND_OBJECT, GRASPS, Evidence, Leaf, Linear, PickUpChoice
 from pycrorm_async.learning.scenes import Stage
 from pycrorm_async.orm import Action
-from pycrorm_async.plan import MoveTCPMotion, Retry, Sequential
+from pycrorm_async.plan import MoveTCPMotion, Retry, Sequential, simulated_robot
 from pycrorm_async.plan.failures import (
     ManipulationGoalInCollision,
     NoRobotHere,
@@ -121,6 +122,17 @@ def test_only_the_requested_arms_and_grasps_are_sampled(stage: Stage) -> None:
         MoveAndPickUp(stage.target, [])
     with pytest.raises(CallerError, match="samples must be >= 1, got 0"):
         MoveAndPickUp(stage.target, samples=0)
+
+
+async def test_a_robot_with_one_arm_gets_no_samples_of_the_other() -> None:
+    with BulletWorld(), simulated_robot:
+        Object("courier", ObjectType.ROBOT)
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.6]))
+        for ways in (MoveAndPickUp(milk), MoveAndPickUp(milk, policy=SuccessModel.untrained())):
+            assert {each.arm for each in ways} == {Arms.RIGHT}
+        assert {each.arm for each in MoveAndPickUp(milk, [Arms.LEFT]).plain()} == {Arms.LEFT}  # fails with the reason
+        async with Memory.open("sqlite://"):
+            assert {each.arm async for each in RecalledPickUp(milk)} == {Arms.RIGHT}
 
 
 def test_samples_for_the_scene_are_free_of_obstacles_and_see_the_object(kitchen: Stage) -> None:

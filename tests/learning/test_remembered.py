@@ -148,6 +148,11 @@ def test_what_cannot_be_learned_from_is_refused_in_one_line() -> None:
         learn_remembered(tries)
     with pytest.raises(NotEnoughExperience, match=r"^0 successes are too few to learn from"):
         learn_remembered(table(["FAILED"] * 40))
+    for model in Learned:
+        with pytest.raises(NotEnoughExperience, match=r"^all 40 pick-ups have no height over the robot: its pose"):
+            learn_remembered(tries.assign(height=np.nan), model)
+    with pytest.raises(NotEnoughExperience, match=r"^10 successes are too few .*; 30 of 40 pick-ups have no height"):
+        SuccessModel.fit(tries.assign(height=[0.9] * 10 + [np.nan] * 30))
     with pytest.raises(NotEnoughExperience, match=r"^no pick-up is remembered .*, with object BOWL: record some"):
         select_tries(tries, {"object": "BOWL"})
     with pytest.raises(CallerError, match=r"^pick-ups have no column 'objects' to choose by; did you mean object"):

@@ -170,6 +170,8 @@ def test_a_sync_memory_predicts_too(tmp_path: Path) -> None:
         memory.flush()
         result = memory.predict("GraspAction", has={"arm": "LEFT"})
         assert (result.chance, result.tries) == pytest.approx(((3 + 4 / 5) / 4, 3.0))
+        assert str(memory.predict("GripAction")) == "not known: never seen: type GripAction; did you mean GraspAction?"
+        assert str(memory.predict("Other")) == "not known: never seen: type Other; there are GraspAction"
 
 
 # === advice ===================================================================================================

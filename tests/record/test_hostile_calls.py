@@ -126,8 +126,10 @@ def test_a_faulty_part_costs_no_node_and_no_object(tmp_path: Path) -> None:
         for number, each in enumerate(parts):
             episode.object_added(number, "thing", ObjectType.MILK, HERE, **each)
             episode.object_moved(number, Pose([2, 0, 0]))
+        episode.joints_moved(0, {"x": math.inf})
 
-    record(tmp_path, write, Settings(fold="at_end"))
+    missing = record(tmp_path, write, Settings(fold="at_end")).missing
+    assert missing.last == "JointsMoved.joints: inf: it must be a finite number"
     assert [row[2] for row in nodes(tmp_path)] == ["SUCCEEDED"] * (len(robots) + 3 + 4)
     added = events(tmp_path, "ObjectAdded")
     assert [each["object_type"] for each in added] == ["MILK"] * 9
