@@ -65,6 +65,7 @@ def print_card(card: PolicyCard) -> None:
     }
     if evaluation is not None:
         facts["from"] = evaluation.experience
+        facts["not known"] = "; ".join(evaluation.unknown)
         facts["failures"] = evaluation.failures
         facts["coverage"] = percent(evaluation.coverage)
         facts["ceiling"] = percent(evaluation.ceiling)

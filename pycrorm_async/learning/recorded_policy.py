@@ -81,6 +81,7 @@ class Evaluation(msgspec.Struct, frozen=True):
         held_out: by each way to hold out pick-ups that the data allows.
         coverage: the share of the successes of other default rollouts that the policy could have made; None if unknown.
         ceiling: the greatest possible share of successes, 0 to 1; None if it was not measured.
+        unknown: what the memory does not know of the samples, such as the place to which the robot was sent.
     """
 
     experience: str | None = None
@@ -88,6 +89,7 @@ class Evaluation(msgspec.Struct, frozen=True):
     held_out: tuple[HeldOut, ...] = ()
     coverage: float | None = None
     ceiling: float | None = None
+    unknown: tuple[str, ...] = ()
 
 
 @dataclass

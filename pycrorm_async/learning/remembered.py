@@ -13,6 +13,8 @@ picks an object up may be out of reach, or occupied, for another. The kind of a 
 | `simulated` or `real` | `simulated` in rollouts and in worlds of this package, `real` if another executive recorded |
 | limits, collisions, furniture, disturbance | the scene of the rollouts; `outside of rollouts` where there is none |
 
+What a memory does not know of some pick-ups is recorded with the policy (`Evaluation.unknown`) and shown on its card.
+
 **Evaluation.** The policy is learned from all tries. For each property in which they differ, such as the seed, the
 height, the object or the scene, the groups with equal values are divided into `FOLDS` parts; each part is predicted by
 what is learned from the others. So the figures hold for new values of the property, and those of `random` for the old
@@ -21,43 +23,40 @@ ones.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Select, and_, select
+from sqlalchemy import Select, and_, func, inspect, null, select
 from sqlalchemy.orm import aliased
 
+from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning.experiment import Learned, choices_of
-from pycrorm_async.learning.features import features_of_frame
-from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.features import PickUpContext, features_of_frame
 from pycrorm_async.learning.policy import Floats, Policy
 from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import CalibrationBin, Evaluation, HeldOut, record_policy
+from pycrorm_async.learning.rollouts import with_parameters
 from pycrorm_async.learning.success_model import CONFIDENT, WITHOUT_HEIGHT, SuccessModel
 from pycrorm_async.learning.tree import learn, learn_polar
 from pycrorm_async.memory import Memory
-from pycrorm_async.orm import (
-    BatchRolloutAction,
-    LearnPolicyAction,
-    PickUpWithContextView,
-    ProcessMetaData,
-    TaskTreeNode,
-)
+from pycrorm_async.projections.derived_views import parameters_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
 from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
     import pandas as pd
+    from sqlalchemy.sql.selectable import NamedFromClause
 
 FOLDS: Final = 5
 """The parts into which the groups are divided, at most; each costs a fit."""
@@ -86,11 +85,21 @@ class RememberedPolicy:
 async def read_tries(reading: Reading) -> pd.DataFrame:
     """Return the pick-ups that succeeded or failed, without those of simulated episodes.
 
-    The columns are those of `MoveAndPickUp.query_with_failures`, and id, uuid (of the episode), object, policy,
-    description, scene (of the rollouts, else the world in one line), seed (of the rollouts) and kind. Raises
-    `MissingExtra` without pandas.
+    A pick-up at a chosen place (`MoveAndPickUpAction`) counts from its start on, also if the robot did not reach the
+    place, and the frame has the place to which the robot was sent: of this one a policy must know the success. Of any
+    other pick-up it has the place where the robot stood.
+
+    The columns are those of `MoveAndPickUp.query_with_failures` and `features.CIRCUMSTANCES`, and id, uuid (of the
+    episode), object, policy, description, scene (of the rollouts, else the world in one line), seed (of the rollouts),
+    kind and place_from: `choice` (recorded with its circumstances), `goal` or `stood`. Raises `MissingExtra` without
+    pandas.
     """
-    frame = await reading.dataframe(_tries())
+    import pandas as pd
+
+    frames = [await reading.dataframe(_at_chosen_places()), await reading.dataframe(_where_the_robot_stood())]
+    frame = pd.concat(each.assign(place_from=place) for each, place in zip(frames, ("goal", "stood"), strict=True))
+    frame = _with_choices(frame.sort_values("id").reset_index(drop=True))
+    await _add_sizes(reading, frame)
     rollouts, world = frame["rollouts"], frame["world"].fillna("")
     simulated = rollouts.notna() | world.str.startswith(_OWN_WORLD)
     frame["kind"] = [
@@ -102,28 +111,102 @@ async def read_tries(reading: Reading) -> pd.DataFrame:
     return frame
 
 
-def _tries() -> Select[Any]:
-    view, episode = PickUpWithContextView, attrgetter("process_metadata_id")
-    picked, tried = aliased(TaskTreeNode), aliased(TaskTreeNode)
-    batch = aliased(BatchRolloutAction, flat=True)
+_episode = attrgetter("process_metadata_id")
+
+
+def _at_chosen_places() -> Select[Any]:
+    """Select the pick-ups at chosen places, with their recorded parameters as JSON."""
+    move, batch = aliased(orm.MoveAndPickUpAction, flat=True), aliased(orm.BatchRolloutAction, flat=True)
+    node, stand = aliased(orm.TaskTreeNode, name="tried"), aliased(orm.Pose)
+    parameters = parameters_of(cast("NamedFromClause", inspect(node).selectable)).label("parameters")
+    policy = func.coalesce(move.policy, batch.policy).label("policy")  # a batch of version 0.1.0 alone names it
     return (
-        MoveAndPickUp.query_with_failures()
-        .add_columns(
-            view.id,
-            ProcessMetaData.uuid,
-            view.obj_type.label("object"),
-            view.policy,
-            view.description,
-            view.scene.label("world"),
-            batch.scene.label("rollouts"),
-            batch.seed,
-        )
-        .join(ProcessMetaData, ProcessMetaData.id == episode(view))
-        .join(picked, and_(picked.id == view.id, episode(picked) == episode(view)))
-        .outerjoin(tried, and_(tried.id == picked.parent_id, episode(tried) == episode(picked)))
-        .outerjoin(batch, and_(batch.id == tried.parent_id, episode(batch) == episode(tried)))
-        .order_by(view.id)
+        _tries(move, node, stand, policy, batch.scene.label("rollouts"), batch.seed, parameters)
+        .outerjoin(batch, and_(batch.id == node.parent_id, _episode(batch) == _episode(node)))
+        .join(stand, and_(stand.id == move.pose_id, _episode(stand) == _episode(move)))
     )
+
+
+def _where_the_robot_stood() -> Select[Any]:
+    """Select the pick-ups that are no part of one at a chosen place."""
+    picked, move = aliased(orm.PickUpAction, flat=True), aliased(orm.MoveAndPickUpAction, flat=True)
+    node, stand = aliased(orm.TaskTreeNode), aliased(orm.Pose)
+    nothing = [null().label(name) for name in ("policy", "rollouts", "seed", "parameters")]
+    return (
+        _tries(picked, node, stand, *nothing)
+        .join(stand, and_(stand.id == node.robot_pose_id, _episode(stand) == _episode(node)))
+        .outerjoin(move, and_(move.id == node.parent_id, _episode(move) == _episode(node)))
+        .where(move.id.is_(None))
+    )
+
+
+def _tries(action: Any, node: Any, stand: Any, *columns: Any) -> Select[Any]:
+    """Select the nodes of an action that succeeded or failed, with the pose of the object, and columns of `stand`."""
+    taken, added, place = aliased(orm.Object), aliased(orm.Object), aliased(orm.Pose)
+    poses = [each.label(f"{name}_{each.key}") for name, pose in (("stand", stand), ("place", place)) for each in (
+        pose.x, pose.y, pose.z, pose.qx, pose.qy, pose.qz, pose.qw, pose.frame
+    )]  # fmt: skip
+    return (
+        select(
+            node.id, orm.ProcessMetaData.uuid, action.arm, action.grasp, node.status, node.robot, node.torso_height,
+            taken.obj_type.label("object"), orm.ProcessMetaData.description, orm.ProcessMetaData.world,
+            added.description_fingerprint.label("model"), *poses, *columns,
+        )
+        .select_from(action)
+        .join(node, and_(node.id == action.id, _episode(node) == _episode(action)))
+        .join(orm.ProcessMetaData, orm.ProcessMetaData.id == _episode(node))
+        .join(taken, and_(taken.id == action.object_id, _episode(taken) == _episode(action)))
+        .join(place, and_(place.id == taken.pose_id, _episode(place) == _episode(taken)))
+        .outerjoin(added, and_(added.id == taken.identity_id, _episode(added) == _episode(taken)))
+        .where(node.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
+    )  # fmt: skip
+
+
+def _with_choices(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the frame with the place in the object's frame, the height, and what the choices record."""
+    dx, dy, dz = (frame[f"stand_{axis}"] - frame[f"place_{axis}"] for axis in "xyz")
+    x, y, z, w = (frame[f"place_q{axis}"] for axis in "xyzw")
+    frame["place_from"] = frame["place_from"].mask(
+        frame["parameters"].str.contains('"relative_x":', na=False), "choice"
+    )
+    placed = frame.assign(
+        # The rows of the transposed rotation matrix.
+        object_x=(1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz,
+        object_y=2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz,
+        height=-dz - frame["torso_height"].astype(float).fillna(0.0),
+        parameters=frame["parameters"].fillna("{}"),
+    )[frame["stand_frame"] == frame["place_frame"]]
+    poses = [name for name in frame.columns if name.startswith(("stand_", "place_q", "place_x", "place_y", "place_z"))]
+    return with_parameters(placed.drop(columns=[*poses, "place_frame"]))
+
+
+async def _add_sizes(reading: Reading, frame: pd.DataFrame) -> None:
+    """Add the size of objects where a try did not record it, from their descriptions."""
+    unknown = frame["width"].isna() & frame["model"].notna()
+    described = orm.ObjectDescription.fingerprint.in_(sorted(set(frame["model"][unknown])))
+    async with reading.session() as session:
+        descriptions = (await session.scalars(select(orm.ObjectDescription).where(described))).all()
+    for each in descriptions:
+        boxes, rows = each.declared.link_boxes, frame.index[unknown & (frame["model"] == each.fingerprint)]
+        if boxes:
+            center, half = (np.array([getattr(box, name) for box in boxes]) for name in ("center", "half"))
+            low, high = (center - half).min(axis=0), (center + half).max(axis=0)
+            x, y, z = (high - low).tolist()
+            context = PickUpContext(math.nan, size=(x, y, z), origin_height=-float(low[2]))
+            for name, values in context.circumstances(choices_of(frame.loc[rows])).items():
+                frame.loc[rows, name] = values
+
+
+def _unknown(tries: pd.DataFrame) -> tuple[str, ...]:
+    """Return what the memory does not know of these tries, each as a line with the number of tries."""
+    place = tries.get("place_from", "stood")
+    counts = {
+        "the place to which the robot was sent: learned from where it stood": place == "stood",
+        "the size of the object": tries.get("width", math.nan) != tries.get("width", math.nan),
+        "the surface below the object": place != "choice",
+        "joint limits, collisions and disturbance": tries["rollouts"].isna(),
+    }
+    return tuple(f"{what} ({count:,} of {len(tries):,})" for what, each in counts.items() if (count := int(each.sum())))
 
 
 def conditions_of(scene: object) -> str:
@@ -221,7 +304,7 @@ def learn_remembered(
         successes,
         min_samples_leaf,
         tuple(sorted({int(seed) for seed in tries["seed"].dropna()})),
-        Evaluation(tries["kind"].iloc[0], failures, tuple(held_out), coverage),
+        Evaluation(tries["kind"].iloc[0], failures, tuple(held_out), coverage, unknown=_unknown(tries)),
     )
 
 
@@ -282,7 +365,7 @@ async def record_remembered(memory: Memory, learned: RememberedPolicy) -> str:
     """Record the policy with its training episodes and its evaluation, unless it is recorded; return its name."""
     name = name_of(learned.policy)
     async with memory.session() as session:
-        if await session.scalar(select(LearnPolicyAction.id).where(LearnPolicyAction.policy == name).limit(1)):
+        if await session.scalar(select(orm.LearnPolicyAction.id).where(orm.LearnPolicyAction.policy == name).limit(1)):
             return name
     async with memory.episode(description=f"policy {name} learned from memory", plan="learn"):
         await record_policy(

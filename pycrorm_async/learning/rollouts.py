@@ -128,11 +128,15 @@ def with_parameters(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the frame with the ways as they were chosen, and their circumstances, for `SuccessModel.fit`.
 
     The place where the robot stood is replaced by that where it was sent, of which a model must predict the success.
+    What a choice did not record stays as it is, or NaN.
     """
     chosen = [msgspec.json.decode(each) for each in frame.pop("parameters")]
     columns = {"object_x": "relative_x", "object_y": "relative_y", "height": "height", "torso_height": "torso"}
-    columns |= {name: name for name in CIRCUMSTANCES}
-    return frame.assign(**{name: [each.get(own, math.nan) for each in chosen] for name, own in columns.items()})
+    for name, own in {**columns, **{name: name for name in CIRCUMSTANCES}}.items():
+        values = np.array([each.get(own) for each in chosen], dtype=np.float64)
+        former = frame[name].astype(np.float64) if name in frame.columns else math.nan
+        frame = frame.assign(**{name: np.where(np.isnan(values), former, values)})
+    return frame
 
 
 def episodes_question(*, scene: str, seeds: Sequence[int], policies: Sequence[str]) -> Select[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning import MoveAndPickUp, Policy, Scene, SuccessModel, batch_rollout, name_of
 from pycrorm_async.learning.experiment import Learned
+from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable
 from pycrorm_async.learning.policy_cards import read_card
 from pycrorm_async.learning.recorded_policy import HeldOut, read_policy
 from pycrorm_async.learning.remembered import (
@@ -25,9 +27,12 @@ from pycrorm_async.learning.remembered import (
     record_remembered,
     select_tries,
 )
+from pycrorm_async.learning.rollouts import randomness
 from pycrorm_async.learning.scenes import Disturbance
 from pycrorm_async.orm import LearnPolicyAction
-from pycrorm_async.world import Pose
+from pycrorm_async.plan.actions import FaceAtPerformable, NavigateActionPerformable, PickUpActionPerformable
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.world import Arms, Grasp, Pose
 from pycrorm_async.world.urdf import Limits
 
 OBJECTS = {"milk": ("MILK", 0.85), "cereal": ("BREAKFAST_CEREAL", 1.05)}
@@ -78,6 +83,12 @@ async def test_a_model_is_learned_from_a_real_robot_and_evaluated_on_other_objec
         evaluation = learned.evaluation
         assert evaluation.experience == "robin, real"
         assert evaluation.failures == TRIES - learned.successes
+        assert evaluation.unknown == (
+            "the place to which the robot was sent: learned from where it stood (160 of 160)",
+            "the size of the object (160 of 160)",
+            "the surface below the object (160 of 160)",
+            "joint limits, collisions and disturbance (160 of 160)",
+        )
         held_out = by(evaluation.held_out)
         assert {name: each.groups for name, each in held_out.items()} == {
             "random": TRIES, "height": 2, "object": 2, "scene": 2,
@@ -115,6 +126,44 @@ async def test_a_tree_is_learned_from_successes_alone(tmp_path: Path) -> None:
     [held_out] = learned.evaluation.held_out  # one object, one height, one scene
     assert (held_out.by, held_out.brier, held_out.calibration) == ("random", None, ())
     assert held_out.confident_successes / held_out.confident > 0.9
+
+
+@pytest.mark.slow
+async def test_tries_have_the_place_to_which_the_robot_was_sent_also_if_it_never_arrived(database_url: str) -> None:
+    scene = Scene(collisions=True, kitchen=True, torso_height=0.3, disturbance=Disturbance(base_m=0.05))
+    count = 25
+    async with Memory.open(database_url) as memory:
+        with scene.entered() as stage:
+            tries = MoveAndPickUp(stage.target)
+            tally = await batch_rollout(
+                tries, count, seed=1, scene=str(scene), reset=stage.reset, prepare=stage.prepare
+            )
+            sent = [tries.drawn(randomness(1, index)) for index in range(count)]
+            box = stage.target.bounding_box().size
+        async with memory.episode(description="alone"):
+            with Scene().entered() as stage:
+                await NavigateActionPerformable(Pose([0.6, 0.7, 0])).perform()
+                await FaceAtPerformable(stage.target.pose).perform()
+                with suppress(PlanFailure):
+                    await PickUpActionPerformable(stage.target, Arms.LEFT, Grasp.FRONT).perform()
+                ways = MoveAndPickUp(stage.target, policy=SuccessModel.untrained(), rng=np.random.default_rng(2))
+                with suppress(PlanFailure):
+                    await (chosen := next(iter(ways))).perform()
+        await memory.flush()
+        frame = await read_tries(memory.reading)
+    rollouts, stood, choice = (part for _, part in frame.groupby(frame.index.map(lambda row: max(row - count + 1, 0))))
+    assert tally.failures["NavigationGoalInCollision"] > 0
+    assert (len(rollouts), int((rollouts.status == "SUCCEEDED").sum())) == (count, tally.successes)
+    there = [(each.standing_position.position.x - 1.3, each.standing_position.position.y - 1.0) for each in sent]
+    assert rollouts[["object_x", "object_y"]].to_numpy() == pytest.approx(np.array(there), abs=1e-9)
+    assert set(rollouts.place_from) == {"goal"}
+    closing = ["x" if each.grasp in (Grasp.LEFT, Grasp.RIGHT) else "y" for each in sent]
+    assert rollouts.width.tolist() == pytest.approx([getattr(box, axis) for axis in closing], abs=1e-5)
+    assert rollouts.height.tolist() == pytest.approx([0.6] * count)
+    assert (stood.place_from.item(), choice.place_from.item()) == ("stood", "choice")
+    assert (stood.object_x.item(), stood.object_y.item()) == pytest.approx((-0.7, -0.3))
+    assert isinstance(chosen, PredictedPickUpPerformable)
+    assert (choice.object_x.item(), choice.torso_height.item()) == (chosen.relative_x, chosen.torso)
 
 
 def test_experience_of_one_kind_agrees_in_limits_collisions_furniture_and_disturbance() -> None:
