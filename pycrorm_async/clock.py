@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from typing import NamedTuple
 
@@ -24,6 +25,17 @@ class Clock(NamedTuple):
 
 SYSTEM_CLOCK = Clock(wall_ns=time.time_ns, monotonic_ns=time.monotonic_ns)
 monotonic_ns = time.monotonic_ns
+_EPOCH, _MICROSECOND = datetime(1970, 1, 1, tzinfo=UTC), timedelta(microseconds=1)
+
+
+def utc_of(microseconds: int) -> datetime:
+    """Return the moment that many µs after 1970 began in UTC. Raises `OverflowError` behind the year 9999."""
+    return _EPOCH + _MICROSECOND * microseconds
+
+
+def microseconds_of(moment: datetime) -> int:
+    """Return the µs from the beginning of 1970 in UTC to a moment, which must have a time zone."""
+    return (moment - _EPOCH) // _MICROSECOND
 
 
 class ClockQuality(NamedTuple):

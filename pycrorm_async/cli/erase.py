@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from typing import Annotated
 
 import typer
@@ -25,6 +24,7 @@ from pycrorm_async.cli.output import (
     problem,
 )
 from pycrorm_async.cli.reading import Place
+from pycrorm_async.clock import utc_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations import removal
 from pycrorm_async.store.log import EventLog
@@ -83,22 +83,18 @@ async def _erase(
     dry_run: bool,
     yes: bool,
 ) -> int:
-    log = await EventLog.open(place.shared_address, create=False)
-    try:
+    async with await EventLog.open(place.shared_address, create=False) as log:
         before = None if keep is None else parse_since(keep)
         rows = await removal.erasable(log, names, ended_before=before, tags=tags)
-        if dry_run or not rows:
-            _print(form, f"To erase from {place.address}", rows)
-            return 0
-        if not yes:
-            listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
-            ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
-        await log.close()
-        log = await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id)
+    if dry_run or not rows:
+        _print(form, f"To erase from {place.address}", rows)
+        return 0
+    if not yes:
+        listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
+        ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
+    async with await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id) as log:
         spool = place.spool or place.address.default_spool
         done = await removal.erase(log, rows, reason=reason, spool=spool, lake=lake)
-    finally:
-        await log.close()
     _print(form, f"Erased from {place.address}", [each.removed for each in done])
     return name_what_is_left(done)
 
@@ -120,11 +116,8 @@ def ask(question: str) -> None:
 
 
 async def _print_journal(place: Place, form: Form) -> int:
-    log = await EventLog.open(place.shared_address, create=False)
-    try:
+    async with await EventLog.open(place.shared_address, create=False) as log:
         removed = await log.all_removed()
-    finally:
-        await log.close()
     _print(form, f"Removed from {place.address}", removed)
     if form.is_table and not removed:
         note("nothing was erased or archived; name the episodes to erase, or give --keep")
@@ -144,4 +137,4 @@ def _print(form: Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) 
 
 def moment_of(wall_ns: int | None) -> str:
     """Return this time as a cell of a table."""
-    return "" if wall_ns is None else moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))
+    return "" if wall_ns is None else moment(utc_of(wall_ns // 1000))

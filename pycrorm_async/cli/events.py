@@ -43,15 +43,12 @@ def events(
 
 async def _print(place: ReadingPlace, episode: str, after: int, event_types: frozenset[str]) -> None:
     """Print the events of these types; without one print all, also those of a type that this version does not know."""
-    log = await place.open_log()
-    try:
+    async with await place.open_log() as log:
         row = await episode_named(log, episode)
         async for page in log.pages(row, after=after):
             for each in page:
                 if not event_types or each.type in event_types:
                     sys.stdout.buffer.write(_line(row.id, each))
-    finally:
-        await log.close()
 
 
 def _line(episode: str, event: StoredEvent) -> bytes:

@@ -71,8 +71,7 @@ async def _create(address: DatabaseAddress, placement: Placement, shards: Sequen
     """Create the log and its tables, unless they exist. Raises `CallerError` if these have another placement."""
     if shards:
         await _make_shards(address, shards)
-    log = await EventLog.open(address, create=True, placement=placement)
-    try:
+    async with await EventLog.open(address, create=True, placement=placement) as log:
         present = await log.placement()
         if present != placement:
             raise CallerError(
@@ -80,8 +79,6 @@ async def _create(address: DatabaseAddress, placement: Placement, shards: Sequen
                 " `pycrorm copy`"
             )
         await Projector(log, installed=own_projections()).open()
-    finally:
-        await log.close()
 
 
 async def _make_shards(coordinator: DatabaseAddress, shards: Sequence[DatabaseAddress]) -> None:

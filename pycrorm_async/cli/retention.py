@@ -128,14 +128,9 @@ async def _apply(place: Place, form: output.Form, *, dry_run: bool, yes: bool) -
 
 async def _with_log(place: Place, act: Callable[[EventLog], Awaitable[T]], *, write: bool = True) -> T:
     """Return the result of an act on the log of a memory, which must exist."""
-    log = await EventLog.open(place.shared_address, create=False)
-    try:
-        if write:
-            await log.close()
-            log = await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id)
+    address = place.shared_address
+    async with await (EventLog.open_to_change(address) if write else EventLog.open(address, create=False)) as log:
         return await act(log)
-    finally:
-        await log.close()
 
 
 def _print_rules(form: output.Form, place: Place, rules: Sequence[RetentionRule]) -> None:

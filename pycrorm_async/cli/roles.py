@@ -52,15 +52,9 @@ def roles(
 
 
 async def _roles(address: DatabaseAddress, *, create: bool, shared: bool) -> list[RoleState]:
-    log = await EventLog.open(address, create=False)
-    if create:  # not at once, because a memory that is missing must not be made
-        await log.close()
-        log = await EventLog.open(address, create=True, belongs_to=log.log_id)
-    try:
+    async with await (EventLog.open_to_change(address) if create else EventLog.open(address, create=False)) as log:
         with log.translated():
             async with log.engine.begin() as connection:
                 if create:
                     await make_roles(connection, shared=shared)
                 return await roles_of(connection)
-    finally:
-        await log.close()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +16,7 @@ import typer
 from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.writer import store_once
+from pycrorm_async.clock import utc_of
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
 from pycrorm_async.operations.recovery import Rebinding
@@ -202,8 +202,8 @@ def _damage_text(damage: maintenance.FileDamage) -> str:
 
 def _time(wall_ns: int) -> str:
     try:
-        return f"{output.moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
-    except (ValueError, OverflowError, OSError):  # the recording machine's clock was not set
+        return f"{output.moment(utc_of(wall_ns // 1000))} UTC"
+    except OverflowError:  # the recording machine's clock was not set
         return f"{wall_ns} ns"
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 import msgspec
@@ -16,7 +16,7 @@ import msgspec
 from pycrorm_async import core
 from pycrorm_async.cli.output import JsonOption, moment, note, print_json, print_table, problem, stdout
 from pycrorm_async.cli.reading import ReadingPlace
-from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.clock import SYSTEM_CLOCK, utc_of
 from pycrorm_async.errors import DatabaseError, DatabaseForeign
 from pycrorm_async.operations.workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections import generations
@@ -66,7 +66,7 @@ def summarise_kept_segments(spool: Path) -> KeptSegments:
     with wrap_os_errors(spool):
         segments = kept_segments(spool)
     return KeptSegments(
-        len(segments), sum(each.bytes for each in segments), _moment(segments[0].stored_ns) if segments else None
+        len(segments), sum(each.bytes for each in segments), utc_of(segments[0].stored_ns // 1000) if segments else None
     )
 
 
@@ -88,14 +88,10 @@ def print_durability(kept: KeptSegments, stored_on: StoredOn | None, went_back: 
             markup=False,
         )
     for each in went_back:
-        when = f"{moment(_moment(each.noticed_wall_ns))} UTC"
+        when = f"{moment(utc_of(each.noticed_wall_ns // 1000))} UTC"
         stdout.print(
             f"The database lost stored events, noticed {when} by {each.noticed_by}: {each.reason}", markup=False
         )
-
-
-def _moment(wall_ns: int) -> datetime:
-    return datetime.fromtimestamp(wall_ns / 1e9, UTC)
 
 
 # === status ===================================================================================================
@@ -351,8 +347,7 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
 
 
 async def _query(address: DatabaseAddress, replica: DatabaseAddress | None) -> DatabaseState:
-    log = await EventLog.open(address, create=False)
-    try:
+    async with await EventLog.open(address, create=False) as log:
         rows = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
         now_ns = SYSTEM_CLOCK.wall_ns()
         episode_states = []
@@ -387,8 +382,6 @@ async def _query(address: DatabaseAddress, replica: DatabaseAddress | None) -> D
             await log.placement(),
             lag,
         )
-    finally:
-        await log.close()
 
 
 async def _lag(log: EventLog, address: DatabaseAddress | None) -> tuple[ReplicaLag | None, list[str]]:
@@ -396,11 +389,8 @@ async def _lag(log: EventLog, address: DatabaseAddress | None) -> tuple[ReplicaL
     if address is None:
         return None, []
     try:
-        replica = await EventLog.open(address, create=False)
-        try:
+        async with await EventLog.open(address, create=False) as replica:
             return await lag_between(replica, log, SETTLE_S), []
-        finally:
-            await replica.close()
     except DatabaseError as fault:
         return None, [f"the replica cannot be read: {fault}"]
 

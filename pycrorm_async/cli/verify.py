@@ -100,16 +100,13 @@ def _read_digests(path: Path) -> list[OutsideDigest]:
 async def _verify(
     place: ReadingPlace, episode: str | None, projections: Sequence[Projection], digests: Sequence[OutsideDigest]
 ) -> tuple[VerifyResult, dict[int, str]]:
-    log = await place.open_log()
-    try:
+    async with await place.open_log() as log:
         only = None if episode is None else await episode_named(log, episode)
         with progress_bar("verifying") as report_progress:
             result = await verify_log(
                 log, episode=only, projections=projections, digests=digests, report_progress=report_progress
             )
         return result, {each.number: each.id for each in ([only] if only else await log.episodes())}
-    finally:
-        await log.close()
 
 
 def _print(result: VerifyResult) -> None:

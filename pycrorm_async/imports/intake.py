@@ -19,13 +19,14 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias, cast, get_args
 
 import msgspec
 
+from pycrorm_async.clock import microseconds_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import episode_text, named_episode_id
 from pycrorm_async.events.types import EpisodeStatus, FieldDeclared, NodeStatus, ObjectValue, PoseValue
@@ -503,7 +504,7 @@ def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map"
 def ns_of(moment: datetime) -> int:
     """Return a time of a map file; one without a zone is in UTC. Raises `CallerError`."""
     aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    if (at := (aware - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000) not in TIMES:
+    if (at := microseconds_of(aware) * 1000) not in TIMES:
         raise CallerError(f"the time {moment} of the map file must be after 1677 and before 2262")
     return at
 

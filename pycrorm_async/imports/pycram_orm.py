@@ -24,11 +24,12 @@ import re
 import sqlite3
 import sys
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 from zoneinfo import ZoneInfo
 
+from pycrorm_async.clock import microseconds_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import NodeStatus, ObjectValue, PoseValue, RobotValue
 from pycrorm_async.imports import intake as intakes
@@ -51,7 +52,6 @@ _OF_THE_TABLES: Final = frozenset(
     {"id", "process_metadata_id", "dtype", "action_dtype", "motion_dtype", "robot_state_id"}
 )
 _CLASS: Final = re.compile(r"(\w+)(?:'>)?\W*$")
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _PROGRESS_NODES: Final = 1_000
 
 
@@ -162,8 +162,7 @@ class _Episode:
         except ValueError:
             return None
         moment = moment.replace(tzinfo=self._zone) if moment.tzinfo is None else moment
-        passed = moment - _EPOCH
-        return ((passed.days * 86_400 + passed.seconds) * 1_000_000 + passed.microseconds) * 1_000
+        return microseconds_of(moment) * 1_000
 
     def _one(self, table: str, id_: Any) -> Mapping[str, Any] | None:
         if id_ is None or table not in self._tables:

@@ -55,9 +55,7 @@ async def archive_episodes(
     the memory runs, `MissingExtra`, and errors of both databases, also for a lake that has episodes of this memory and
     is missing; what was moved until then stays moved.
     """
-    log = await EventLog.open(shared_address(url), create=False)
-    await log.close()
-    log = await EventLog.open(shared_address(url), create=True, belongs_to=log.log_id)
+    log = await EventLog.open_to_change(shared_address(url))
     summary = ArchiveSummary([], {})
     try:
         async with claimed(log):

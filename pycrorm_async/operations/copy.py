@@ -136,8 +136,7 @@ async def read_archived(lake: str, episodes: Sequence[str] = ()) -> AsyncIterato
 async def _open_target(address: DatabaseAddress, source: Source) -> AsyncIterator[tuple[EventLog, LogAndTables]]:
     """Open the target's log and tables, creating them if they are missing, with the source's placement if possible."""
     placement = PLAIN if address.is_sqlite else Placement((await source.placement()).partitions)
-    log = await EventLog.open(address, create=True, placement=placement)
-    try:
+    async with await EventLog.open(address, create=True, placement=placement) as log:
         if log.log_id == source.log_id:
             raise CallerError(
                 f"{source.address} and {address} are the same memory, or file copies of one memory: copy to a new URL"
@@ -151,8 +150,6 @@ async def _open_target(address: DatabaseAddress, source: Source) -> AsyncIterato
             yield log, destination
         finally:
             await destination.group.leave()
-    finally:
-        await log.close()
 
 
 class _Copier:
@@ -372,9 +369,7 @@ async def tag_episode(
 
     Raises `CallerError` for an episode that has not ended or does not have a removed tag, and `UnknownEpisode`.
     """
-    existing = await EventLog.open(address, create=False)
-    await existing.close()
-    log = await EventLog.open(address, create=True, belongs_to=existing.log_id)
+    log = await EventLog.open_to_change(address)
     try:
         row = await episode_named(log, name)
         for _ in range(_ATTEMPTS):

@@ -97,8 +97,7 @@ async def rebuild_outdated(address: DatabaseAddress, *, clock: Clock = SYSTEM_CL
     Opening a larger one logs a warning instead, because a plan must not wait for a rebuild of unknown length.
     """
     try:
-        log = await EventLog.open(address, create=False)
-        try:
+        async with await EventLog.open(address, create=False) as log:
             async with log.reading() as connection:
                 made = (await read_generations(connection)).get(SHOWN)
             _, events = await recorded(log)
@@ -106,8 +105,6 @@ async def rebuild_outdated(address: DatabaseAddress, *, clock: Clock = SYSTEM_CL
                 return
             versions = f"version {made.version} of the fold, this is version {PROJECTION_VERSION}"
             _log.warning("the tables were made by %s: rebuilding them from %s events", versions, f"{events:,}")
-        finally:
-            await log.close()
         with progress_bar("rebuilding") as report_progress:
             await rebuild_memory(address, report_progress=report_progress, clock=clock)
     except (DatabaseUnavailable, DatabaseForeign):
@@ -129,12 +126,8 @@ async def rebuild_projection(
 
 async def projections_of(url: str) -> list[str]:
     """Return the names of the projections that have tables in a memory, also of those whose code is not installed."""
-    log = await EventLog.open(shared_address(url), create=False)
-    try:
-        async with log.reading() as connection:
-            return [*projections_in(await read_generations(connection))]
-    finally:
-        await log.close()
+    async with await EventLog.open(shared_address(url), create=False) as log, log.reading() as connection:
+        return [*projections_in(await read_generations(connection))]
 
 
 async def _run(
@@ -146,8 +139,7 @@ async def _run(
 ) -> RebuildSummary:
     address = shared_address(url)
     await (await EventLog.open(address, create=False)).close()  # raises where no memory exists, instead of creating one
-    log = await EventLog.open(address, create=True, busy_timeout_s=_busy_timeout_s(address))
-    try:
+    async with await EventLog.open(address, create=True, busy_timeout_s=_busy_timeout_s(address)) as log:
         async with claimed(log):
             began = clock.monotonic_ns()
             await clear(log)
@@ -170,8 +162,6 @@ async def _run(
             left=left,
             damaged={number: each for number, each in ids.items() if not is_episode_id(each)},
         )
-    finally:
-        await log.close()
 
 
 def _busy_timeout_s(address: DatabaseAddress) -> float:

@@ -90,22 +90,16 @@ class LogEpisodes:
             time.sleep(_PAUSE_S)
 
     async def _row(self, episode: EpisodeId) -> tuple[int, int, int | None] | None:
-        log = await EventLog.open(self._address, create=False)
-        try:
+        async with await EventLog.open(self._address, create=False) as log:
             row = await log.episode(episode)
             removed = {} if row is not None else await log.removed([episode])
-        finally:
-            await log.close()
         if removed:
             raise EpisodeRefused(f"nothing is recorded of it: {removed[episode]}")
         return None if row is None else (row.number, row.head, row.ended_wall_ns)
 
     async def _page(self, number: int, after: int, last: int) -> Sequence[StoredPayload]:
-        log = await EventLog.open(self._address, create=False)
-        try:
+        async with await EventLog.open(self._address, create=False) as log:
             events = await log.events(number, after=after, limit=last - after)
-        finally:
-            await log.close()
         return [StoredPayload(each.sequence, each.type, each.version, each.payload) for each in events]
 
 

@@ -15,7 +15,7 @@ selects. `orm.base` loads the columns of subclasses and related rows when an att
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from enum import Enum
 from importlib import import_module
 from operator import attrgetter
@@ -50,6 +50,7 @@ from sqlalchemy.orm.exc import DetachedInstanceError, ObjectDeletedError
 from sqlalchemy.types import TypeDecorator
 from sqlalchemy.util.concurrency import in_greenlet
 
+from pycrorm_async.clock import microseconds_of, utc_of
 from pycrorm_async.errors import CallerError, PycrormError
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_key
@@ -58,12 +59,9 @@ from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
 # === types ====================================================================================================
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_MICROSECOND = timedelta(microseconds=1)
-
 
 def _moment(value: int | None) -> datetime | None:
-    return None if value is None else _EPOCH + _MICROSECOND * value
+    return None if value is None else utc_of(value)
 
 
 def _decoded(text: str | None) -> Any:
@@ -83,7 +81,7 @@ class UtcTime(TypeDecorator[datetime]):
             return None
         if value.tzinfo is None:
             raise ValueError(f"{value!r} has no time zone: write datetime(..., tzinfo=UTC)")
-        return (value - _EPOCH) // _MICROSECOND
+        return microseconds_of(value)
 
     def result_processor(self, dialect: sa.Dialect, coltype: object) -> Callable[[int | None], datetime | None]:  # noqa: ARG002
         return _moment

@@ -16,10 +16,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeAlias, TypeVar
 
-from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.clock import SYSTEM_CLOCK, microseconds_of, utc_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import failures
 from pycrorm_async.world.bullet import Object, current_world
@@ -166,7 +166,7 @@ class LocatedObject(ObjectDesignator):
         world_object: Object | None = None,
         frozen_pose: Pose | None = None,
     ) -> None:
-        moment = timestamp if timestamp is not None else _moment(SYSTEM_CLOCK.wall_ns())
+        moment = timestamp if timestamp is not None else utc_of(SYSTEM_CLOCK.wall_ns() // 1000)
         put = object.__setattr__
         put(self, "name", name)
         put(self, "object_type", object_type)
@@ -187,7 +187,7 @@ class LocatedObject(ObjectDesignator):
         if self.frozen_pose is not None:
             return self.frozen_pose
         pose = self.reference.pose @ self.relative_pose
-        return Pose(pose.position, pose.orientation, pose.frame, _nanoseconds(self.timestamp))
+        return Pose(pose.position, pose.orientation, pose.frame, microseconds_of(self.timestamp) * 1000)
 
     def frozen_copy(self) -> LocatedObject:
         return LocatedObject(
@@ -368,17 +368,6 @@ def _check(designator: ObjectDesignator, **expected: type) -> None:
     ]
     if wrong:
         raise failures.ResolutionError(type(designator).__name__, wrong=wrong)
-
-
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-def _moment(wall_ns: int) -> datetime:
-    return _EPOCH + timedelta(microseconds=wall_ns // 1000)
-
-
-def _nanoseconds(moment: datetime) -> int:
-    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
 
 
 # === current robot ============================================================================================

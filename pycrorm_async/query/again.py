@@ -29,7 +29,6 @@ import inspect
 import logging
 import typing
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime, timedelta
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
@@ -41,6 +40,7 @@ from xml.etree.ElementTree import ParseError
 from sqlalchemy import inspect as inspect_row
 
 from pycrorm_async import orm
+from pycrorm_async.clock import microseconds_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.plan import objects
@@ -58,7 +58,6 @@ from pycrorm_async.world.pose import DuplicateName, ObjectType, Pose, Vector, Wo
 from pycrorm_async.world.urdf import robot_description
 
 _log = logging.getLogger("pycrorm_async")
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _WITHOUT_POSE = "object {!r} was recorded as one outside the world, and without a pose"
 
 
@@ -246,8 +245,8 @@ def _member(enum: type[Enum], name: str) -> Enum:
 
 
 def _pose(row: orm.Pose) -> Pose:
-    time_ns = (row.time - _EPOCH) // timedelta(microseconds=1) * 1000
-    return Pose((row.x, row.y, row.z), (row.qx, row.qy, row.qz, row.qw), row.frame, time_ns)
+    turn = row.qx, row.qy, row.qz, row.qw
+    return Pose((row.x, row.y, row.z), turn, row.frame, microseconds_of(row.time) * 1000)
 
 
 def _pose_of_entry(entry: orm.ParameterItem) -> Pose:

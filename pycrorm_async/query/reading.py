@@ -203,11 +203,8 @@ class Reading:
 
     async def _learn_apart(self) -> None:
         """Learn the types on a connection of its own, in any loop."""
-        log = await EventLog.open(self._address, create=False)
-        try:
+        async with await EventLog.open(self._address, create=False) as log:
             await self._learn(log)
-        finally:
-            await log.close()
 
     async def present_names(self) -> Mapping[str, str]:
         """Return the present name of each type that was declared, by all the names that it had."""

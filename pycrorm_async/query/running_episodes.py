@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 
 from sqlalchemy import BigInteger, column, func, select, table
 from sqlalchemy.ext.asyncio import AsyncConnection
 
+from pycrorm_async.clock import utc_of
 from pycrorm_async.task_status import TaskStatus
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _episode = table("process_metadata", *(column(name) for name in ("id", "uuid", "created_at", "description", "status")))
 _robot = table(
     "episode_robot",
@@ -67,7 +67,7 @@ async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[lis
         RunningEpisode(
             each.id,
             each.uuid,
-            _EPOCH + timedelta(microseconds=each.created_at),
+            utc_of(each.created_at),
             each.description,
             tuple(robots.get(each.id, ())),
         )

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from pycrorm_async import world
+from pycrorm_async.clock import microseconds_of, utc_of
 from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.ids import SLOT_NODE, row_id
@@ -226,7 +227,6 @@ class Moment(NotebookValue):
 _NUMBERS_END = 1e15
 _END_WITHIN = 100
 """Bounds the last events that are searched for the end of an episode, behind which only tags may follow."""
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 _Within: TypeAlias = Callable[[int, StoredEvent], bool]
 """Takes the monotonic time of the first event and another event; returns whether this is not later than the moment."""
@@ -323,7 +323,7 @@ def _limit(time: float | datetime | None, sequence: int | None) -> tuple[str, _W
     if isinstance(time, datetime):
         if time.utcoffset() is None:
             raise CallerError(f"{time!r} has no time zone: add one, for example .replace(tzinfo=UTC)")
-        wall_us = (time - _EPOCH) // timedelta(microseconds=1)
+        wall_us = microseconds_of(time)
         return time.isoformat(" "), lambda _, event: event.wall_ns // 1000 <= wall_us
     seconds = _number(time, Real)
     if seconds is None:
@@ -375,11 +375,11 @@ def moment_of(
         id=replay.id,
         description=started.description,
         created_by=started.created_by,
-        started_at=_moment(replay.begin_wall_ns),
+        started_at=utc_of(replay.begin_wall_ns // 1000),
         simulated=started.simulated,
         sequence=replay.at.sequence,
         time_s=replay.at.since_ns / 1e9,
-        at=_moment(replay.wall_ns),
+        at=utc_of(replay.wall_ns // 1000),
         status=replay.status,
         tree=tuple(_tree(replay)),
         world=_world(replay, descriptions, meshes),
@@ -422,7 +422,7 @@ def _node(replay: EpisodeReplay, node: ReplayedNode, depth: int) -> NodeThen:
         kind=node.kind,
         parameters=replay.parameters(node),
         status=node.status,
-        started_at=_moment(node.wall_ns),
+        started_at=utc_of(node.wall_ns // 1000),
         duration_ns=end.since_ns - start.since_ns if end is not None else None,
         reason=node.reason,
         failure_message=node.message,
@@ -476,7 +476,3 @@ def _robot(robot: ObjectThen) -> RobotThen:
     description = robot_description(robot.model or robot.name)
     torso = description.torso_joint if description is not None else None
     return RobotThen(robot.name, robot.pose, robot.joints.get(torso) if torso is not None else None)
-
-
-def _moment(wall_ns: int) -> datetime:
-    return _EPOCH + timedelta(microseconds=wall_ns // 1000)

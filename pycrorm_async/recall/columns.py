@@ -8,7 +8,7 @@ has a float for each case, NaN for none.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from functools import cached_property
 from itertools import chain
 from typing import Any, NamedTuple, TypeAlias
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pycrorm_async.clock import utc_of
 from pycrorm_async.events.ids import row_key
 
 Mask: TypeAlias = NDArray[np.bool_]
@@ -230,7 +231,6 @@ TEXT_MAX = 120
 """The longest symbol in characters. A longer text is prose, which hardly ever recurs, and is left out."""
 SINGLE_MAX = 2.0**24
 """Up to this magnitude a number is kept as float32, which here is exact to 1 or better; beyond it as float64."""
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Case(NamedTuple):
@@ -273,7 +273,7 @@ class Case(NamedTuple):
     @property
     def started_at(self) -> datetime:
         """The moment of its start, to the microsecond."""
-        return _EPOCH + timedelta(microseconds=self.started_us)
+        return utc_of(self.started_us)
 
 
 def is_angle(feature: str) -> bool:

@@ -14,7 +14,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from importlib import import_module
 from inspect import isawaitable
 from numbers import Real
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Select, select
 
 from pycrorm_async import errors
-from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock, microseconds_of
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, SLOT_NODE, row_id, row_id_min, row_key
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import ActionDescription, Designator
@@ -482,7 +482,6 @@ AnyCase: TypeAlias = "Case | RecalledCase | int"
 """A case, or the id of its task-tree node."""
 TimeReference: TypeAlias = "datetime | str | AnyCase"
 """A moment: an aware datetime, or a text in ISO 8601, UTC where it has no zone; or a case, for its start or its end."""
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _OF_EACH_CASE = frozenset({"object_name"})
 """The texts of a case that `cue_like` leaves out: they name one object of many alike."""
 
@@ -673,7 +672,7 @@ def _moment_us(when: datetime | str) -> int:
         when = moment if moment.utcoffset() is not None else moment.replace(tzinfo=UTC)
     if when.utcoffset() is None:
         raise errors.CallerError(f"{when!r} has no time zone: add one, for example .replace(tzinfo=UTC)")
-    return (when - _EPOCH) // timedelta(microseconds=1)
+    return microseconds_of(when)
 
 
 # === database source ==========================================================================================

@@ -8,10 +8,9 @@ it: an event that is given an earlier time happens, by this clock, with the even
 from __future__ import annotations
 
 import operator
-from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, TypeAlias
 
-from pycrorm_async.clock import Clock
+from pycrorm_async.clock import Clock, utc_of
 from pycrorm_async.errors import CallerError
 
 At: TypeAlias = int | tuple[int, int]
@@ -19,7 +18,6 @@ At: TypeAlias = int | tuple[int, int]
 _NS = range(-(2**63), 2**63)
 _TOLERANCE_NS = 1_000_000_000
 """Bounds how far a time may go back without a warning: the stamps of two sensors differ by less."""
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class EventTime(NamedTuple):
@@ -105,6 +103,6 @@ class EventTimes:
 
 def _text(wall_ns: int) -> str:
     try:
-        return f"{_EPOCH + timedelta(microseconds=wall_ns // 1000):%Y-%m-%dT%H:%M:%S.%fZ}"
+        return f"{utc_of(wall_ns // 1000):%Y-%m-%dT%H:%M:%S.%fZ}"
     except OverflowError:
         return f"{wall_ns} ns"

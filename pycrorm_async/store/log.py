@@ -18,7 +18,7 @@ from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequen
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 from sqlalchemy import ColumnElement, Executable, Select, func, select
@@ -134,6 +134,19 @@ class EventLog:
     def translated(self) -> AbstractContextManager[None]:
         """Translate driver errors raised inside to errors of this package; for code that uses `engine` directly."""
         return self._dialect.translated(str(self.address))
+
+    @classmethod
+    async def open_to_change(cls, address: DatabaseAddress) -> EventLog:
+        """Open an existing log for writing. Raises `DatabaseUnavailable` where there is none, instead of making one."""
+        async with await cls.open(address, create=False) as existing:
+            log_id = existing.log_id
+        return await cls.open(address, create=True, belongs_to=log_id)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_raised: object) -> None:
+        await self.close()
 
     async def close(self) -> None:
         """Close every connection. Does nothing in a forked child, because the connections belong to the parent."""

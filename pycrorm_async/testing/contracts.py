@@ -55,12 +55,9 @@ async def check_projection(projection: Projection, plan: Callable[[], Awaitable[
             await plan()
         await memory.flush()
     live = await _rows_of(projection, url)
-    log = await EventLog.open(shared_address(url), create=False)
-    try:
+    async with await EventLog.open(shared_address(url), create=False) as log:
         [state] = [each for each in await states(log, [projection]) if each.name == projection.name]
         second = await verify(log, projections=[projection])
-    finally:
-        await log.close()
     assert not state.parked, f"{projection.name} stopped: {', '.join(state.parked.values())}"
     assert not second.drift, f"a second fold of {projection.name} differs, so it is not pure: {second.differences[0]}"
     await rebuild_projection(url, projection)
@@ -129,11 +126,8 @@ async def check_executive(drive: Callable[[Recording], object], folder: Path) ->
     for each in nodes:
         what = "an episode" if each.dtype is None else f"node {each.id}, a {each.dtype},"
         assert each.status not in (TaskStatus.RUNNING, TaskStatus.LOST), f"{what} did not end: it is {each.status.name}"
-    log = await EventLog.open(shared_address(url), create=False)
-    try:
+    async with await EventLog.open(shared_address(url), create=False) as log:
         second = await verify(log)
-    finally:
-        await log.close()
     findings = [*second.damages, *second.stopped, *second.differences]
     assert not findings, f"the log or the tables are wrong: {findings[0]}"
     nodes = [each for each in nodes if each.dtype is not None]
