@@ -22,7 +22,7 @@ from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.scenes import ExportedEpisode, Frames, frames_of, read_episode
 from pycrorm_async.query.again import world_of
 from pycrorm_async.query.frames import needed_pyarrow
-from pycrorm_async.query.picture import png
+from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment, moments
 from pycrorm_async.query.text import parameters_text
@@ -203,7 +203,7 @@ class LeRobotFolder:
             for name, values in columns.items()
         }
         if pictures is not None:
-            encoded = [{"bytes": png(each), "path": None} for each in pictures]
+            encoded = [{"bytes": png_of(each, 9), "path": None} for each in pictures]
             arrays[_PICTURE] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
         table = pa.table(arrays)
         if self._writer is not None and self._file_bytes > _FILE_MEGABYTES * 2**20:

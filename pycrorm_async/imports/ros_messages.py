@@ -30,6 +30,7 @@ import numpy as np
 from pycrorm_async.events.types import Blob
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
+from pycrorm_async.world.pose import dot, product, rotated
 
 _COORDINATES: Final = ("map", "odom", "world", "earth", "odom_combined")
 """Frames that connect others, and are no objects: those of REP 105, and the usual one of simulators. The first of them
@@ -356,34 +357,17 @@ class _Frames:
             if link is None:
                 return None
             at, (x, y, z, qx, qy, qz, qw) = link
-            turned = _turned((qx, qy, qz, qw), position)
+            turned = rotated((qx, qy, qz, qw), position)
             position = (x + turned[0], y + turned[1], z + turned[2])
-            rotation = _product((qx, qy, qz, qw), rotation)
+            rotation = product((qx, qy, qz, qw), rotation)
         return None
-
-
-def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float, float]:
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def _turned(rotation: tuple[float, ...], vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    qx, qy, qz, qw = rotation
-    x, y, z, _ = _product(_product(rotation, (*vector, 0.0)), (-qx, -qy, -qz, qw))
-    return x, y, z
 
 
 def _differs(pose: _Pose, before: _Pose) -> bool:
     if math.dist(pose.position, before.position) > _MOVED_M:
         return True
-    product = abs(sum(a * b for a, b in zip(pose.rotation, before.rotation, strict=True)))
-    return 2 * math.acos(min(1.0, product)) > _TURNED_RAD
+    likeness = abs(dot(pose.rotation, before.rotation))
+    return 2 * math.acos(min(1.0, likeness)) > _TURNED_RAD
 
 
 # === actions ==================================================================================================

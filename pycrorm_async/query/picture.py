@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import struct
-import zlib
 from collections.abc import Collection, Sequence
 from contextvars import Context
 from dataclasses import replace
@@ -16,7 +14,6 @@ from datetime import datetime
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import Select, func, select
 
 from pycrorm_async.errors import CallerError
@@ -24,6 +21,7 @@ from pycrorm_async.events.ids import row_key
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectRemoval
 from pycrorm_async.query.again import RecordedWorld, world_of
+from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene import object_model
@@ -139,7 +137,7 @@ def _drawn(
             reason = world.assumed[points[0]].removeprefix("a point, because ")
             raise CallerError(f"episode {then.number} has no shapes to draw: of {points[0]}, {reason}")
         camera = _camera(world, framed.difference(points) or framed, size, yaw_deg, pitch_deg)
-        return png(photograph(world, camera, *size).pixels)
+        return png_of(photograph(world, camera, *size).pixels, 9)
 
 
 def _drawable(then: Moment) -> Moment:
@@ -192,16 +190,3 @@ def _visible(world: RecordedWorld, camera: Camera, radius: float, actors: Sequen
     picture = photograph(world, camera, 80, 60, smooth=False)
     covered = float((picture.depths < camera.distance_m - 1.2 * radius).mean())
     return sum(math.log1p(int((picture.bodies == each.body.number).sum())) for each in actors) * (1 - covered)
-
-
-def png(pixels: NDArray[np.uint8]) -> bytes:
-    """Encode pixels of shape (height, width, 3)."""
-    height, width, _ = pixels.shape
-
-    def chunk(name: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, width * 3)], axis=1)
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    content = zlib.compress(rows.tobytes(), 9)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", content) + chunk(b"IEND", b"")
