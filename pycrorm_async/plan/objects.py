@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
 
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ class ObjectDesignatorDescription:
         return tuple(each.name for each in self.types) if self.types is not None else None
 
 
-def _as_tuple(name: str, kind: type[T], values: T | Iterable[T] | None) -> tuple[T, ...] | None:
+def _as_tuple(name: str, kind: type[_T], values: _T | Iterable[_T] | None) -> tuple[_T, ...] | None:
     if values is None:
         return None
     items: tuple[Any, ...]
