@@ -15,7 +15,8 @@ group, an episode is folded twice at most, and one of the two is rolled back.
 A process whose session stays and that does not fold, because it or its fold worker is stopped, or its machine has lost
 its power, does not keep the events of its share from the tables. With each look a process takes a second lock, whose
 key is the number of the look, and releases the one before. A process that the others see with the same number for
-`_STALL_S` is not counted until it looks again. Only this process' own clock measures that time.
+`_STALL_S` is not counted until it looks again. Only this process' own clock measures that time, and of a pause of its
+own, in which the whole machine may have been stopped, it measures a part.
 
 SQLite has one writer at a time, and no group.
 """
@@ -41,7 +42,8 @@ _STALL_S: Final = 10.0
 """The time after which a process that has not looked does not count: longer than a batch takes on a busy machine, and
 so short that a flush, which waits for 15 s, does not end before another process has folded what it waits for."""
 _PAUSE_S: Final = 5.0
-"""A process that has not looked itself for this long counts all others again: they may have been stopped with it."""
+"""The most time between two looks of a process that it counts as silence of the others, which may have been stopped
+with it: half of `_STALL_S`, so that they look again before they do not count."""
 
 
 class FoldGroup:
@@ -55,7 +57,7 @@ class FoldGroup:
         self._look_number = 0
         self._seen: Mapping[
             int, tuple[int | None, float]
-        ] = {}  # by process id, its last look, and when it was new here
+        ] = {}  # by process id, its last look, and the time for which it has not changed
         self._turn = asyncio.Lock()  # a session executes one statement at a time
 
     async def share(self) -> Share:
@@ -114,13 +116,15 @@ class FoldGroup:
         except BaseException:
             await self._end_session()
             raise
-        now_s = time.monotonic()
-        known = self._seen if now_s <= self._looked_s + _PAUSE_S else {}
-        seen = {each: known.get(each, (None, 0.0)) for each in looks}
-        self._seen = {each: seen[each] if seen[each][0] == look else (look, now_s) for each, look in looks.items()}
+        passed_s = min(time.monotonic() - self._looked_s, _PAUSE_S)
+        before = self._seen
+        self._seen = {
+            each: (look, before[each][1] + passed_s if each in before and before[each][0] == look else 0.0)
+            for each, look in looks.items()
+        }
         active = [
             each
-            for each, (look, since_s) in sorted(self._seen.items())
-            if each == own or look is None or now_s <= since_s + _STALL_S  # a process of an earlier version has no look
+            for each, (look, silent_s) in sorted(self._seen.items())
+            if each == own or look is None or silent_s <= _STALL_S  # a process of an earlier version has no look
         ]
         return Share(active.index(own), len(active))

@@ -160,8 +160,11 @@ class Reading:
         async with self._opening:
             self._opened = None
             self._classes.dispose()
-            for source in self._sources.values():
-                await source.log.close()
+            await self._close_sources()
+
+    async def _close_sources(self) -> None:
+        while self._sources:
+            await self._sources.popitem()[1].log.close()
 
     async def follow(self) -> None:
         """Read from the replica once it shows what has been committed, which is awaited; until then from the memory."""
@@ -489,11 +492,12 @@ class Reading:
                     log = await open_to_read(self._address, self._replica)
                     try:
                         await _generation(log)
+                        self._source(log)
+                        self._use(await self._current_log() if self._follows and self._replica is not None else log)
                     except BaseException:
-                        await log.close()
+                        await self._close_sources()
+                        await log.close()  # which may be none of them
                         raise
-                    self._source(log)
-                    self._use(await self._current_log() if self._follows and self._replica is not None else log)
 
     def _use(self, log: EventLog) -> None:
         self._sessions = self._source(log).sessions

@@ -196,15 +196,23 @@ _SHARE_MIN = 1_000
 def share_out(behind: Sequence[EpisodeRow], limit: int) -> list[Span]:
     """Divide the next `limit` events among these episodes, so that none waits for long.
 
+    An episode gets its rest whole, if that is at most twice its share: a projection that has a state for each episode
+    reads all its events again where a later batch, of another process, has the last few.
+
     >>> share_out([EpisodeRow(1, "", head=90_000, folded=0, started_wall_ns=0)], 100)
     [Span(number=1, after=0, last=100)]
+    >>> behind = [EpisodeRow(each, "", head=1_002, folded=0, started_wall_ns=0) for each in range(1, 11)]
+    >>> [each.last for each in share_out(behind, 10_000)]
+    [1002, 1002, 1002, 1002, 1002, 1002, 1002, 1002, 1002]
     """
     share = max(limit // len(behind), _SHARE_MIN) if behind else 0
     spans: list[Span] = []
     for each in behind:
-        count = min(each.head - each.folded, share, limit)
-        if count <= 0:
-            break
+        rest = each.head - each.folded
+        count = rest if rest <= 2 * share else share
+        if count > limit and spans:
+            break  # the next batch begins with this episode
+        count = min(count, limit)
         spans.append(Span(each.number, each.folded, each.folded + count))
         limit -= count
     return spans

@@ -173,6 +173,19 @@ async def test_a_process_reads_an_event_of_an_open_episode_once(log: EventLog) -
     assert Attempts.read == Counter({f"1/{sequence}": 1 for sequence in range(1, 9)})
 
 
+async def test_workers_in_turn_read_an_event_of_an_episode_once_that_is_a_little_longer_than_its_share(
+    log: EventLog,
+) -> None:
+    tries = [("LEFT", "FAILED")] * 510
+    await log.append([*declarations(PICK_UP), *(each for n in range(1, 23) for each in episode(n, tries).records)])
+    Attempts.read.clear()
+    workers = [await projector_of(log) for _ in range(2)]
+    while await workers[0].runner.fold_next([each.runner for each in workers]) is not None:
+        pass
+    await workers[0].catch_up()
+    assert set(Attempts.read.values()) == {1}
+
+
 async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

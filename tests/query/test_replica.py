@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, DatabaseUnavailable
 from pycrorm_async.plan import SimulatedTaskTree
 from pycrorm_async.query import reading as reading_module
 from pycrorm_async.query.reading import Reading
@@ -134,6 +134,24 @@ async def test_a_replica_that_does_not_answer_is_replaced_by_the_memory_and_anot
         with pytest.raises(CallerError, match=r"holds another memory|is no replica of"):
             async with Reading.open(url, read_url=wrong):
                 pass
+
+
+async def test_a_question_that_cannot_be_asked_leaves_no_connection_open(
+    replicas: Replicas, database: str, tmp_path: Path
+) -> None:
+    url, standby = replicas.url(database), replicas.standby_url(database)
+    async with Memory.open(url, read_url=standby, spool=tmp_path / "spool", settings=SETTINGS) as memory:
+        await record(memory, 1)
+        replicas.stop_primary()
+        try:
+            for _ in range(3):
+                with pytest.raises(DatabaseUnavailable):
+                    await steps(memory)
+            sessions = "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
+            assert ask(standby, sessions) == [(1,)]  # the one that asks
+        finally:
+            replicas.start_primary()
+        assert await steps(memory) == [1]
 
 
 async def test_a_replica_that_was_promoted_beside_its_primary_is_not_read(
