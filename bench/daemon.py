@@ -2,15 +2,20 @@
 
     python -m bench.daemon               200,000 events on SQLite; --postgresql on a new server
     python -m bench.daemon --quick       2,000 events
+    python -m bench.daemon --daemons 1 2 8     several daemons alone
 
 The recorders record everything before the daemon starts, so the daemon runs at its full rate. The script prints one
 JSON line: events a second until the last one is stored, and until the last one is visible in the tables.
 
-On PostgreSQL 1, 4 and 8 daemons, each with a recorder and a spool of its own, then drain as many events into one
-database, in turn for `ROUNDS` rounds. Of the best rounds the line has the time until all is visible and the processor
-time of the daemons, as multiples of those of one daemon, and how often an event was read from the log.
+On PostgreSQL 1, 2 and 8 daemons, each with a recorder and a spool of its own, then drain as many events into one
+database, in turn for `--rounds` rounds. The line has, for each number of daemons, the processor time of an event in µs
+in the daemons with their fold workers and in the server, the time until all is visible, and the reads of an event in
+the log: the least of the rounds. `rate_by_cpu` and `rate_by_wall` are the rates as multiples of that of the first
+number. Where other programs use the machine, only the processor time says how the rates would be on an idle one,
+on which the daemons and the server use all cores.
 """
 
+import argparse
 import asyncio
 import json
 import os
@@ -19,18 +24,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import AsyncExitStack, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
+from bench.reporting.figures import console
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
 from tests.databases import Server, ask, server_in
 
-EVENTS = 2_000 if "--quick" in sys.argv else 200_000
-DAEMONS = (1, 4, 8)
 WARM_UP = 5_000
-ROUNDS = 1 if "--quick" in sys.argv else 4
 READ = "SELECT idx_tup_fetch + seq_tup_read FROM pg_stat_user_tables WHERE relname = 'event'"
 
 
@@ -64,13 +69,13 @@ def stop(daemon: subprocess.Popen[str]) -> None:
     daemon.communicate()
 
 
-async def drain(url: str, spool: Path, recorders: int) -> dict[str, int]:
+async def drain(url: str, spool: Path, recorders: int, events: int) -> dict[str, int]:
     async with AsyncExitStack() as stack:
         memories = [
             await stack.enter_async_context(Memory.open(url, spool=spool, writer="daemon")) for _ in range(recorders)
         ]
         for memory in memories:
-            await record(memory, EVENTS // recorders)
+            await record(memory, events // recorders)
             await memory.synced()
         total = sum(memory.status.written for memory in memories)
         daemon = start_daemon(url, spool)
@@ -87,8 +92,18 @@ async def drain(url: str, spool: Path, recorders: int) -> dict[str, int]:
     return {"stored_per_s": round(total / stored_s), "shown_per_s": round(total / visible_s)}
 
 
-async def drain_by(url: str, folder: Path, daemons: int) -> tuple[float, float, float]:
-    """Return wall and processor seconds of several daemons on one database, and reads of an event in the log."""
+class Cost(NamedTuple):
+    """The cost of an event: processor time in µs of the daemons and of the server, wall time in µs, and reads."""
+
+    daemons_us: float
+    server_us: float
+    wall_us: float
+    reads: float
+
+
+async def drain_by(server: Server, folder: Path, daemons: int, events: int) -> Cost:
+    """Drain the spools of so many recorders by so many daemons into one new memory."""
+    url = server.new_memory()
     spools = [folder / f"{each}.spool" for each in range(daemons)]
     started = [start_daemon(url, each) for each in spools]
     async with AsyncExitStack() as stack:
@@ -100,21 +115,23 @@ async def drain_by(url: str, folder: Path, daemons: int) -> tuple[float, float, 
             each.send_signal(signal.SIGSTOP)
         before, reads = sum(memory.status.written for memory in memories), await counted_reads(url)
         for memory in memories:
-            await record(memory, EVENTS // daemons)
+            await record(memory, before // daemons + events // daemons)
             await memory.synced()
         total = sum(memory.status.written for memory in memories)
-        began_s, before_s = time.perf_counter(), sum(map(processor_s, started))
+        began_s, daemons_s = time.perf_counter(), sum(processor_s(each.pid) for each in started)
+        server_s = processor_s(server.postmaster.pid)
         for each in started:
             each.send_signal(signal.SIGCONT)
-        wall_s = 0.0
-        while not wall_s:
-            await asyncio.sleep(0.01)
-            if sum(memory.status.folded or 0 for memory in memories) == total:
-                wall_s = time.perf_counter() - began_s
-        cpu_s = sum(map(processor_s, started)) - before_s
+        while sum(memory.status.folded or 0 for memory in memories) < total:  # noqa: ASYNC110  as a plan would ask
+            await asyncio.sleep(0.02)
+        wall_s = time.perf_counter() - began_s
+        daemons_s = sum(processor_s(each.pid) for each in started) - daemons_s
+        server_s = processor_s(server.postmaster.pid) - server_s
     for each in started:
         stop(each)
-    return wall_s, cpu_s, (await counted_reads(url) - reads) / (total - before)
+    count = total - before
+    read = await counted_reads(url) - reads
+    return Cost(daemons_s / count * 1e6, server_s / count * 1e6, wall_s / count * 1e6, read / count)
 
 
 async def counted_reads(url: str) -> int:
@@ -123,41 +140,60 @@ async def counted_reads(url: str) -> int:
     return int(count)
 
 
-def processor_s(daemon: subprocess.Popen[str]) -> float:
-    """Return the processor time of a daemon and its fold workers."""
-    children = Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split()
-    fields = [Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split() for each in (daemon.pid, *children)]
-    return sum(int(each[11]) + int(each[12]) for each in fields) / os.sysconf("SC_CLK_TCK")
+def processor_s(pid: int) -> float:
+    """Return the processor time of a process and its children, also of those that have ended."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    ticks = 0
+    for each in (str(pid), *children):
+        fields = Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()
+        ticks += sum(map(int, fields[11:15] if each == str(pid) else fields[11:13]))
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
-async def compare(server: Server, folder: Path) -> dict[str, object]:
-    rounds: dict[int, list[tuple[float, float, float]]] = {each: [] for each in DAEMONS}
-    for index in range(ROUNDS):
-        for daemons, results in rounds.items():
-            results.append(await drain_by(server.new_memory(), folder / f"{index}.{daemons}", daemons))
-    best = {daemons: [min(each) for each in zip(*results, strict=True)] for daemons, results in rounds.items()}
+async def compare(server: Server, folder: Path, numbers: Sequence[int], rounds: int, events: int) -> dict[str, object]:
+    costs: dict[int, list[Cost]] = {each: [] for each in numbers}
+    for index in range(rounds):
+        for daemons in numbers if index % 2 == 0 else numbers[::-1]:
+            costs[daemons].append(await drain_by(server, folder / f"{index}.{daemons}", daemons, events))
+            console().print(f"{daemons} daemons: {costs[daemons][-1]}, load {os.getloadavg()[0]:.1f}")
+    cpu_us = {each: min(cost.daemons_us + cost.server_us for cost in costs[each]) for each in numbers}
+    best = {each: Cost(*map(min, zip(*costs[each], strict=True))) for each in numbers}
     return {
-        f"by_{daemons}": {
-            "wall": round(wall_s / best[1][0], 2),
-            "cpu": round(cpu_s / best[1][1], 2),
-            "reads_per_event": round(reads, 2),
+        f"by_{each}": {
+            **{name: round(value, 2) for name, value in best[each]._asdict().items()},
+            "rate_by_cpu": round(cpu_us[numbers[0]] / cpu_us[each], 3),
+            "rate_by_wall": round(best[numbers[0]].wall_us / best[each].wall_us, 3),
         }
-        for daemons, (wall_s, cpu_s, reads) in best.items()
+        for each in numbers
     }
 
 
-async def measure(stack: ExitStack, *, postgresql: bool) -> dict[str, object]:
+async def measure(stack: ExitStack, options: argparse.Namespace) -> dict[str, object]:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-    server = stack.enter_context(server_in(folder / "pg")) if postgresql else None
-    result: dict[str, object] = {"bench": "daemon", "database": "postgresql" if postgresql else "sqlite"}
-    for recorders in (1, 4):
+    server = stack.enter_context(server_in(folder / "pg")) if options.postgresql or options.daemons else None
+    result: dict[str, object] = {"bench": "daemon", "database": "postgresql" if server else "sqlite"}
+    for recorders in () if options.daemons else (1, 4):
         url = server.new_database() if server else f"sqlite:///{folder}/{recorders}.db"
-        result[f"from_{recorders}"] = await drain(url, folder / f"{recorders}.spool", recorders)
+        result[f"from_{recorders}"] = await drain(url, folder / f"{recorders}.spool", recorders, options.events)
     if server:
-        result |= await compare(server, folder)
-    return result | {"events": EVENTS}
+        numbers = options.daemons or [1, 2, 8]
+        result |= await compare(server, folder, numbers, options.rounds, options.events)
+    return result | {"events": options.events}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--postgresql", action="store_true", help="on a new server, and several daemons too")
+    parser.add_argument("--daemons", type=int, nargs="+", help="only these numbers of daemons, on a new server")
+    parser.add_argument("--events", type=int, default=200_000)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--quick", action="store_true", help="2,000 events and one round")
+    options = parser.parse_args()
+    if options.quick:
+        options.events, options.rounds = 2_000, 1
+    with ExitStack() as stack:
+        print(json.dumps(asyncio.run(measure(stack, options))))
 
 
 if __name__ == "__main__":
-    with ExitStack() as stack:
-        print(json.dumps(asyncio.run(measure(stack, postgresql="--postgresql" in sys.argv))))
+    main()

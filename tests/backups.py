@@ -130,6 +130,15 @@ class Replicas:
     def start_primary(self) -> None:
         self._start(self._primary)
 
+    def stop_standby(self) -> None:
+        """Crash the standby."""
+        assert self._standby is not None
+        self._stop(self._standby)
+
+    def start_standby(self) -> None:
+        assert self._standby is not None
+        self._start(self._standby)
+
     def fail_over(self) -> None:
         """Crash the primary, promote the standby, and move the address to it."""
         assert self._standby is not None

@@ -20,7 +20,7 @@ import typer
 from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import JsonOption, note, print_facts, print_json, print_table
 from pycrorm_async.cli.policy import percent, print_card
-from pycrorm_async.cli.reading import DEFAULT_URL, Place, ReadingPlace
+from pycrorm_async.cli.reading import DEFAULT_URL, ReadingPlace
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
 from pycrorm_async.learning import remembered
@@ -143,7 +143,7 @@ def learn(
     figure: Annotated[Path, typer.Option(help="File for the figure of both policies: .png, .svg or .pdf.")] = Path(
         "policies.png"
     ),
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,
 ) -> None:
     """Record random pick-ups, learn a policy from the successful ones, and evaluate it.
@@ -172,6 +172,11 @@ def learn(
         raise CallerError("--where belongs to --from-memory")
     if cluster is not None and "--workers" in options:
         raise CallerError("--cluster performs the rollouts in its own workers: leave out --workers")
+    if place.read_url:
+        raise CallerError(
+            "an experiment reads what it has just recorded, which a replica may lack: leave out --read-url"
+            " (PYCRORM_READ_URL), or learn with --from-memory"
+        )
     model = model or Learned.PLACES
     if explore is not None and model is not Learned.SUCCESS:
         raise CallerError(f"--explore {explore} needs --model success: other policies try as they act")
@@ -194,7 +199,7 @@ def learn(
         resume=resume,
     )
     _check_packages(model, cluster)
-    location = MemoryLocation(*place)
+    location = MemoryLocation(*place.place)
     with progress_bar("rollouts", unit="rollouts") as bar:
 
         def report_progress(name: str, done: int, total: int, tally: Tally) -> None:
@@ -215,7 +220,7 @@ def learn(
         print_json(_document(experiment, learned, in_kitchen, studied, policy, figure))
         return
     _print(learned, in_kitchen, studied)
-    option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(place.address.to_type)}"
+    option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(place.place.address.to_type)}"
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
 
 
@@ -238,14 +243,14 @@ def _conditions(where: list[str]) -> dict[str, str]:
 
 
 def _learn_from_memory(
-    where: dict[str, str], file: Path, place: Place, model: Learned, min_samples_leaf: int, *, as_json: bool
+    where: dict[str, str], file: Path, place: ReadingPlace, model: Learned, min_samples_leaf: int, *, as_json: bool
 ) -> None:
-    tries = remembered.select_tries(ReadingPlace(*place).read(remembered.read_tries), where)
+    tries = remembered.select_tries(place.read(remembered.read_tries), where)
     with progress_bar("learning", unit="fits") as bar:
         learned = remembered.learn_remembered(tries, model, min_samples_leaf=min_samples_leaf, report_progress=bar)
 
     async def record() -> PolicyCard:
-        async with Memory.open(place.url, spool=place.spool) as memory:
+        async with Memory.open(place.url, spool=place.spool, read_url=place.read_url) as memory:
             return await read_card(memory.reading, await remembered.record_remembered(memory, learned))
 
     card = asyncio.run(record())

@@ -25,7 +25,7 @@ import typer
 
 from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import FileAccessOption, Form, ProjectionOption, WriterOption, note, print_rows, problem
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import Place, ReadingPlace
 from pycrorm_async.errors import CallerError, EpisodeParked, TablesPending
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.memory import Memory
@@ -51,7 +51,7 @@ def run(
             metavar="PLAN.py[:function]", help="File and async function of the plan; default function: `plan`."
         ),
     ],
-    place: Place,
+    place: ReadingPlace,
     description: Annotated[
         str | None, typer.Option(help="Description of the episode; default: the function's docstring, or its name.")
     ] = None,
@@ -125,11 +125,14 @@ def run(
         settings=settings,
         projections=load_projections(projection or ()),
         plan_source=plan_source(loaded.path, loaded.sha256),
+        read_url=place.read_url,
     )
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if not form.is_table else nullcontext():
         try:
-            recorded = _run_and_record(loaded, memory, place, description or loaded.description, seed, tags, outcome)
+            recorded = _run_and_record(
+                loaded, memory, place.place, description or loaded.description, seed, tags, outcome
+            )
             asyncio.run(recorded)
         except asyncio.CancelledError as cancelled:  # the plan cancelled itself; Ctrl-C is a KeyboardInterrupt here
             outcome.failure = cancelled

@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pycrorm_async.cli.output import JsonOption, note, print_json, print_line, stdout
-from pycrorm_async.cli.reading import Place
+from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.cli.show import tree_of
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.live.access import kept_token
@@ -46,7 +46,7 @@ def watch(
         typer.Option(min=0, max=65535, help="Port of the page; default: 8137, or a free one if that is in use."),
     ] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the page in this machine's browser.")] = False,
-    place: Place,
+    place: ReadingPlace,
     as_json: JsonOption = False,
 ) -> None:
     """Follow running episodes live: the page of the report, served on this machine and read-only, until Ctrl-C.
@@ -58,9 +58,9 @@ def watch(
     """
     if terminal and (port is not None or open_it or as_json):
         raise CallerError("--terminal serves no page: leave out --port, --open and --json")
-    address = place.shared_address
-    place.note_pending_events()
-    follower = LogFollower(address)
+    memory = place.place
+    follower = LogFollower(memory.shared_address, place.replica)
+    memory.note_pending_events()
     follow = _draw(follower, episode) if terminal else _serve(follower, episode, port, open_it=open_it, as_json=as_json)
     asyncio.run(_closed_after(follower, follow))
 

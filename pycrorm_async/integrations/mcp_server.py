@@ -31,6 +31,7 @@ from pycrorm_async.query.sql import SqlLimits, json_rows
 from pycrorm_async.query.text import duration, nearest, one_line, parameters_text
 from pycrorm_async.recall.recall import Recall, case_named
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.replica import lag_line
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.visible_text import escaped_json, visible
 
@@ -84,9 +85,12 @@ _Status: TypeAlias = Annotated[
 ]
 
 
-def memory_server(address: DatabaseAddress) -> MCPServer:
-    """Return the server of the memory at a located address; its `run_stdio_async` serves until stdin is closed."""
-    tools = _Tools(address)
+def memory_server(address: DatabaseAddress, replica: DatabaseAddress | None = None) -> MCPServer:
+    """Return the server of the memory at a located address; its `run_stdio_async` serves until stdin is closed.
+
+    With a replica it reads that; then `now` says how far it is behind.
+    """
+    tools = _Tools(address, replica)
     own = "episodes now show why_failed at picture compare recall predict schema query".split()
     functions: list[_Function] = [
         *(getattr(tools, each) for each in own),
@@ -169,9 +173,9 @@ def _with_tool_errors(tool: _Function, tools: _Tools) -> _Function:
 class _Tools:
     """The tools. The docstring of each is its description for the model."""
 
-    def __init__(self, address: DatabaseAddress) -> None:
-        self._address = address
-        self._reading = Reading(address)
+    def __init__(self, address: DatabaseAddress, replica: DatabaseAddress | None) -> None:
+        self._address, self._replica = address, replica
+        self._reading = Reading(address, replica=replica)
         self._recall = Recall.of(self._reading)
         self._file: tuple[int, int] | None = None
 
@@ -185,7 +189,7 @@ class _Tools:
 
     async def close(self) -> None:
         """Close the connections; the next call opens the database again."""
-        reading, self._reading = self._reading, Reading(self._address)
+        reading, self._reading = self._reading, Reading(self._address, replica=self._replica)
         self._recall = Recall.of(self._reading)
         await reading.close()
 
@@ -215,7 +219,8 @@ class _Tools:
         newest = sorted(running)[-_RUNNING_MAX:]
         moments = [await reading.as_of(each, sequence=SEQUENCE_MAX) for each in newest]
         lines = [each for moment in moments if not moment.simulated for each in _moment(moment)]
-        return _cut(lines or ["no episode runs"])
+        lag = await lag_line(log, self._address)
+        return _cut([*([lag] if lag is not None else []), *(lines or ["no episode runs"])])
 
     async def show(
         self,

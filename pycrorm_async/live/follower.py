@@ -5,7 +5,8 @@ have grown, as long as a page listens, and folds the new events of those that ar
 however many pages show it. After each turn it wakes the listeners, and each takes the part of the document behind the
 event that it has sent last. A feed has a lock, because a part must not be taken while events are folded. The log is
 only read. If the database does not exist yet or does not answer, `fault` has the reason and the task tries again; if
-it was replaced, the feeds are thrown away and `epoch` counts it, and the pages load again.
+it was replaced, the feeds are thrown away and `epoch` counts it, and the pages load again. A replica that does not
+answer counts as replaced, by the memory itself; of one that is behind, `fault` has how far.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ from pycrorm_async.report.overview import (
 from pycrorm_async.report.write import outcomes_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named, grown_episodes, is_simulated
+from pycrorm_async.store.replica import lag_line, open_to_read
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
 _INTERVAL_S = 0.05
@@ -56,6 +58,8 @@ _IDLE_TURNS = 40
 """The turns without a change after which the log is queried less often, to spare the robot's processor."""
 _RETRY_S = 0.5
 """Delays the next attempt if the database does not answer."""
+_LAG_INTERVAL_S = 5.0
+"""The time between two checks whether a replica is behind, each with a new connection to its primary."""
 OUTCOMES_S = 1.0
 """The shortest time between two queries of the outcomes of failures, which need the tables and not the events."""
 _FEEDS_MAX = 8
@@ -113,23 +117,26 @@ class EpisodeFeed:
 
 
 class LogFollower:
-    """Follows the log at an address.
+    """Follows the log at an address, on its replica if one is given.
 
     Attributes:
-        fault: why the log cannot be read at the moment, or None.
+        fault: why the log cannot be read at the moment, or how far the replica is behind; None if neither is so.
         turn: counts the turns in which something changed.
         epoch: counts how often the database was replaced.
         began: number of the newest episode, except simulations, that began while the log was followed; 0 without one.
         overview: the present activity of each episode.
     """
 
-    def __init__(self, address: DatabaseAddress) -> None:
+    def __init__(self, address: DatabaseAddress, replica: DatabaseAddress | None = None) -> None:
         self.address = address
+        self._replica = replica
+        self._is_lost = False
+        self._lag: tuple[float, str | None] = -math.inf, None
         self.fault: str | None = None
         self.turn = 0
         self.epoch = 0
         self.began = 0
-        self.overview = LiveOverview(address)
+        self.overview = LiveOverview(address, replica)
         self._log: EventLog | None = None
         self._file: tuple[int, int] | None = None
         self._newest: int | None = None
@@ -150,9 +157,10 @@ class LogFollower:
                 fault = self.fault
                 try:
                     changed = await self._take_turn()
-                    self.fault = None
+                    self.fault = await self._lag_now()
                 except (DatabaseUnavailable, DatabaseForeign) as error:
                     changed, self.fault = False, str(error)
+                    self._is_lost = self._replica is not None
                 unchanged = 0 if changed else unchanged + 1
                 if changed or fault != self.fault:
                     await self._wake()
@@ -170,18 +178,27 @@ class LogFollower:
         """Return the open log. Raises `DatabaseUnavailable`, `DatabaseForeign`."""
         async with self._opening:
             file = self._identity()
-            if self._log is not None and file == self._file:
+            if self._log is not None and file == self._file and not self._is_lost:
                 return self._log
-            opened = await EventLog.open(self.address, create=False)  # fails as long as there is none
+            opened = await open_to_read(self.address, self._replica)  # fails as long as there is none
             former, self._log, self._file = self._log, opened, file  # before a wait, which may be cancelled
+            self._is_lost = False
             if former is not None:
-                overview, self.overview = self.overview, LiveOverview(self.address)
+                overview, self.overview = self.overview, LiveOverview(self.address, self._replica)
                 self._feeds.clear()
                 self._growing.clear()
                 self.began, self._newest = 0, None
                 self.epoch += 1
                 await _close(overview, former)
             return opened
+
+    async def _lag_now(self) -> str | None:
+        """Return the line about a replica that is behind, as of the last check."""
+        checked_s, line = self._lag
+        if self._replica is not None and time.monotonic() >= checked_s + _LAG_INTERVAL_S:
+            line = await lag_line(await self.log(), self.address)
+            self._lag = time.monotonic(), line
+        return line
 
     def _identity(self) -> tuple[int, int] | None:
         """Return device and inode of a SQLite file, by which a file that replaces it differs."""
@@ -295,9 +312,9 @@ class LiveOverview:
         listeners: number of pages that follow it.
     """
 
-    def __init__(self, address: DatabaseAddress) -> None:
+    def __init__(self, address: DatabaseAddress, replica: DatabaseAddress | None) -> None:
         self.listeners = 0
-        self._reading = Reading(address)
+        self._reading = Reading(address, replica=replica)
         self._activities: dict[int, Activity] = {}
         self._changed_at: dict[int, int] = {}
         """The turn in which an episode's entry changed last, by its number."""

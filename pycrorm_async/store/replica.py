@@ -77,7 +77,7 @@ async def open_to_read(primary: DatabaseAddress, replica: DatabaseAddress | None
     log = None
     try:
         log = await EventLog.open(replica, create=False)
-        lag = await lag_of(log, primary)
+        lag = await lag_line(log, primary)
     except BaseException as fault:
         if log is not None:
             await log.close()
@@ -85,13 +85,24 @@ async def open_to_read(primary: DatabaseAddress, replica: DatabaseAddress | None
             raise
         _log.warning("the replica does not answer: %s; reading from %s", fault, primary)
         return await EventLog.open(primary, create=False)
-    if lag.behind_bytes is None or (lag.behind_bytes > 0 and (lag.last_change_s or 0.0) > LAG_S_MAX):
-        _log.warning("the replica %s %s", replica, lag)
+    if lag is not None:
+        _log.warning("%s", lag)
     return log
 
 
-async def lag_of(replica: EventLog, primary: DatabaseAddress) -> ReplicaLag:
-    """Return how far a replica is behind. Raises as `lag_between` does."""
+async def lag_line(log: EventLog, primary: DatabaseAddress) -> str | None:
+    """Return a line if this is the log of a replica that is behind, or whose primary does not answer; else None.
+
+    Raises as `lag_between` does.
+    """
+    if log.address == primary:
+        return None
+    lag = await _lag_of(log, primary)
+    is_behind = lag.behind_bytes is None or (lag.behind_bytes > 0 and (lag.last_change_s or 0.0) > LAG_S_MAX)
+    return f"the replica {log.address} {lag}" if is_behind else None
+
+
+async def _lag_of(replica: EventLog, primary: DatabaseAddress) -> ReplicaLag:
     try:
         log = await EventLog.open(primary, create=False)
     except DatabaseUnavailable:

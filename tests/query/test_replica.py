@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 import time
 from collections.abc import Iterator
@@ -13,10 +14,13 @@ from sqlalchemy import func, select
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError, DatabaseUnavailable
+from pycrorm_async.live import follower
+from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.plan import SimulatedTaskTree
 from pycrorm_async.query import reading as reading_module
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store import replica
+from pycrorm_async.store.address import DatabaseAddress
 from tests.backups import Replicas, replicas_in
 from tests.commands import NOTES_PLAN, answer, pycrorm
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
@@ -136,6 +140,59 @@ async def test_a_replica_that_does_not_answer_is_replaced_by_the_memory_and_anot
                 pass
 
 
+async def test_a_page_and_an_agent_read_the_replica_are_told_its_lag_and_read_the_memory_while_it_is_away(
+    replicas: Replicas, database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replica, "LAG_S_MAX", 0.0)
+    monkeypatch.setattr(follower, "_LAG_INTERVAL_S", 0.0)
+    url, standby = (DatabaseAddress.parse(each) for each in (replicas.url(database), replicas.standby_url(database)))
+    from mcp import Client
+
+    from pycrorm_async.integrations.mcp_server import memory_server
+
+    page = LogFollower(url, standby)
+
+    async def now() -> str:
+        """Return the answer of the server of the agent, also one that is an error."""
+        return str((await client.call_tool("now", {})).content[0].text)  # type: ignore[union-attr]
+
+    async with (
+        Client(memory_server(url, standby)) as client,
+        Memory.open(url.to_type, spool=tmp_path / "spool", settings=SETTINGS) as memory,
+    ):
+        await record(memory, 1)
+        following = asyncio.create_task(page.run())
+        async with page.listening(page.overview):
+
+            async def until(fault: str | None) -> None:
+                async with asyncio.timeout(20):
+                    while page.fault != fault if fault is None else fault not in (page.fault or ""):  # noqa: ASYNC110
+                        await asyncio.sleep(0.05)
+
+            await until(None)
+            assert ((await page.log()).address, await now()) == (standby, "no episode runs")
+            ask(replicas.standby_url(database), "SELECT pg_wal_replay_pause()")
+            await record(memory, 2)
+            await until("KiB of its primary's changes")
+            assert "KiB of its primary's changes" in await now()
+            assert await (await page.log()).last_number() == 1
+            ask(replicas.standby_url(database), "SELECT pg_wal_replay_resume()")
+            await until(None)
+            assert await (await page.log()).last_number() == 2
+            replicas.stop_standby()
+            try:
+                async with asyncio.timeout(20):
+                    while (await page.log()).address != url:  # noqa: ASYNC110
+                        await asyncio.sleep(0.05)
+                await until(None)
+                assert await now() != "no episode runs"  # the connection is lost
+                assert await now() == "no episode runs"
+            finally:
+                replicas.start_standby()
+        following.cancel()
+        await asyncio.gather(following, return_exceptions=True)
+
+
 async def test_a_question_that_cannot_be_asked_leaves_no_connection_open(
     replicas: Replicas, database: str, tmp_path: Path
 ) -> None:
@@ -188,12 +245,16 @@ def test_each_reading_verb_answers_from_a_replica_alone(replicas: Replicas, data
     url, standby = replicas.url(database), replicas.standby_url(database)
     (tmp_path / "notes.py").write_text(NOTES_PLAN)
     at = ("--url", url, "--read-url", standby, "--spool", str(tmp_path / "spool"))
-    pycrorm("run", "notes.py", *at[:2], *at[4:], cwd=tmp_path)
+    done = pycrorm("run", "notes.py", *at, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("replica")) == (0, 0)
+    refused = pycrorm("learn", *at, cwd=tmp_path)
+    assert (refused.returncode, "learn with --from-memory" in refused.stderr) == (2, True)
     assert answer("episodes", *at, cwd=tmp_path) == answer("episodes", *at[:2], *at[4:], cwd=tmp_path)
     replicas.stop_primary()
     try:
         for verb in (
             ("episodes",),
+            ("watch", "last", "--terminal"),
             ("show", "last"),
             ("events", "last"),
             ("verify",),
