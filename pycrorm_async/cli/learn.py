@@ -52,7 +52,8 @@ from pycrorm_async.world.urdf import Limits
 
 LEAVES = {Learned.PLACES: 25, Learned.POLAR: 20, Learned.SUCCESS: 10}
 """The rows in a leaf, unless others are chosen."""
-_FROM_MEMORY = ("--from-memory", "--where", "--model", "--min-samples-leaf", "--policy", "--url", "--spool", "--json")
+_PLACE = ("--url", "--spool", "--read-url")
+_FROM_MEMORY = ("--from-memory", "--where", "--model", "--min-samples-leaf", "--policy", *_PLACE, "--json")
 """The options that mean something with --from-memory."""
 _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
