@@ -109,7 +109,7 @@ async def report(
 
 _EPISODE = (
     "dom episode find bodies extent path_lines scene_camera seen_view scene_view map_view tree_view gantt_bars"
-    " gantt_view similar panels playback main"
+    " gantt_view curves_view similar panels playback main"
 ).split()
 """The modules of the page's program, every one behind those that it imports."""
 _STREAM = ("stream",)
@@ -123,7 +123,9 @@ _ESCAPES = {
     b"\xe2\x80\xa8": rb"\u2028",
     b"\xe2\x80\xa9": rb"\u2029",
 }
-_IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
+_UNREAD = re.compile(
+    r"^import \{[^}]*\} from \"\./\w+\.js\";\n|^ *//[^\n]*\n|^ */\*\*.*?\*/\n|^ +", re.MULTILINE | re.DOTALL
+)
 _EXPORT = re.compile(r"^export (?=(const|class|function) )", re.MULTILINE)
 
 
@@ -166,8 +168,8 @@ def _safe_json(document: Mapping[str, Any]) -> str:
 
 @cache
 def program(*modules: str) -> str:
-    """Return modules of the page as one, without the imports among them."""
-    text = "\n".join(_EXPORT.sub("", _IMPORT.sub("", asset(f"web/{name}.js"))) for name in modules)
+    """Return modules of the page as one, without imports among them, comments on lines of their own, and indents."""
+    text = "\n".join(_EXPORT.sub("", _UNREAD.sub("", asset(f"web/{name}.js"))) for name in modules)
     return f'"use strict";\n{{\n{text}}}\n'
 
 

@@ -82,6 +82,10 @@ class Robot:
         self._episode.object_moved("base", Pose([x, 0, 0]))
         self._memory.flush()
 
+    def observe(self, name: str, values: object) -> None:
+        self._episode.observe(name, values)
+        self._memory.flush()
+
     def end(self, key: str, status: NodeStatus = "SUCCEEDED", message: str | None = None) -> None:
         self._episode.end(key, status, message)
         self._memory.flush()

@@ -152,6 +152,33 @@ def test_a_page_stays_at_a_moment_until_it_is_asked_to_follow(
             assert page.problems() == []
 
 
+def test_a_curve_below_the_chart_grows_with_its_episode(
+    chrome: Browser, watch: Callable[..., Watch], tmp_path: Path
+) -> None:
+    drawn = "document.querySelector('.overlay path')?.getAttribute('d').match(/V/g)?.length"
+    with robot_in(tmp_path) as robot:
+        robot.start("one")
+        for volts in (12.5, 12):
+            robot.observe("battery", volts)
+        server = watch("--port", "0", "1")
+        with chrome.open(server.address) as page:
+            page.wait_for(f"{WORDS} === '● live'")
+            page.ask("pycrormPage.panels.open('states'); document.querySelector('.curves button').click()")
+            assert page.ask(drawn) == 1
+            ends = "[...document.querySelectorAll('.overlay text')].map((each) => each.textContent)"
+            for volts in (11.5, 11):
+                robot.observe("battery", volts)
+            page.wait_for(f"{drawn} === 3")
+            assert page.ask(ends) == ["12.5", "11"]
+            assert page.ask("document.querySelector('.legend b').textContent") == "11 "
+            page.ask("pycrormPage.gantt.press(new KeyboardEvent('keydown', { key: 'w' }))")
+            window = page.ask("pycrormPage.gantt.window")
+            robot.observe("battery", 14)
+            page.wait_for("pycrormPage.gantt.places.split(',')[3] === '9'")
+            assert page.ask("pycrormPage.gantt.window") == window
+            assert page.problems() == []
+
+
 def test_no_page_of_another_origin_can_read_the_stream(
     chrome: Browser, watch: Callable[..., Watch], tmp_path: Path
 ) -> None:

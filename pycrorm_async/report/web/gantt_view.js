@@ -5,6 +5,7 @@ import { drawLane, LANE_PX, roundTicks } from "./gantt_bars.js";
 
 const AXIS_PX = 26;
 const TEXT_PX = 11; // the middle of the labels; below them is what part of the whole is drawn
+const MAP_PX = 12; // of the axis, from its lower edge on, are the map of the whole to the pointer
 const TICK_PX = 90;
 const PAD_PX = 8;
 const HEADING_PX = 17;
@@ -13,15 +14,12 @@ const STEP = 0.2; // of what is drawn, by one key
 export class GanttView {
   /** `onDraw` is called when other events have other places. */
   constructor(holder, episode, { onSeek, onSelect, onDraw }) {
-    this.holder = holder;
-    this.onDraw = onDraw;
-    this.episode = episode;
+    Object.assign(this, { holder, episode, onSeek, onDraw });
     this.canvas = document.createElement("canvas");
     const keys = "W and S zoom, A and D move, 0 shows all";
     for (const [name, value] of Object.entries({ role: "application", tabindex: 0, "aria-label": `Gantt chart of the nodes: ${keys}` })) {
       this.canvas.setAttribute(name, value);
     }
-    this.canvas.addEventListener("keydown", (pressed) => this.#press(pressed));
     this.axis = element("canvas", { class: "axis", "aria-hidden": "true" });
     holder.append(this.canvas, this.axis);
     this.byTime = false;
@@ -29,24 +27,33 @@ export class GanttView {
     this.lanes = new Lanes();
     this.lanes.extend(episode.nodes);
     this.window = this.extent = this.#all();
-    let dragging = false;
-    const seek = (pointed) => onSeek(this.#eventAt(pointed.offsetX));
-    this.canvas.addEventListener("pointerdown", (pointed) => {
-      dragging = true;
-      this.canvas.setPointerCapture(pointed.pointerId);
-      const node = this.#nodeAt(pointed.offsetX, pointed.offsetY);
-      seek(pointed);
+    this.steer(this.canvas, ({ offsetX, offsetY }) => {
+      const node = this.#nodeAt(offsetX, offsetY);
       if (node !== null) onSelect(node, { seek: false });
     });
-    this.canvas.addEventListener("pointermove", (pointed) => {
-      if (dragging) seek(pointed);
-      const node = this.#nodeAt(pointed.offsetX, pointed.offsetY);
+    this.steer(this.axis);
+    this.canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
+      const node = this.#nodeAt(offsetX, offsetY);
       this.canvas.title = node === null ? "" : plain(`${node.name} ${node.status} ${node.parameters}`.slice(0, 200));
     });
-    for (const kind of ["pointerup", "pointercancel"]) this.canvas.addEventListener(kind, () => (dragging = false));
-    this.canvas.addEventListener("wheel", (turned) => this.#zoom(turned), { passive: false });
-    this.canvas.addEventListener("dblclick", () => this.#showWindow(this.#all()));
     new ResizeObserver(() => this.draw()).observe(holder);
+  }
+
+  /** Let the keys, the wheel and the pointer on an element as wide as the chart move what is drawn, and the moment. */
+  steer(surface, onPoint = () => {}) {
+    let drag = null;
+    surface.addEventListener("keydown", (pressed) => this.press(pressed));
+    surface.addEventListener("wheel", (turned) => this.#turn(turned), { passive: false });
+    surface.addEventListener("dblclick", () => this.#showWindow(this.#all()));
+    surface.addEventListener("pointerdown", (pointed) => {
+      surface.setPointerCapture(pointed.pointerId);
+      const onMap = surface === this.axis && pointed.offsetY >= AXIS_PX - MAP_PX && !this.#isWhole;
+      drag = onMap ? ({ offsetX }) => this.#centre(offsetX) : ({ offsetX }) => this.onSeek(this.#eventAt(offsetX));
+      drag(pointed);
+      if (!onMap) onPoint(pointed);
+    });
+    surface.addEventListener("pointermove", (pointed) => drag?.(pointed));
+    for (const kind of ["pointerup", "pointercancel"]) surface.addEventListener(kind, () => (drag = null));
   }
 
   setAxis(byTime) {
@@ -98,12 +105,13 @@ export class GanttView {
     this.draw();
   }
 
-  #zoom(turned) {
-    if (!turned.ctrlKey && !turned.shiftKey && Math.abs(turned.deltaY) <= Math.abs(turned.deltaX)) return;
+  /** Zoom by the wheel; move by a sideways one, or with Shift. */
+  #turn(turned) {
+    const { deltaX, deltaY, ctrlKey, shiftKey, offsetX } = turned;
     turned.preventDefault();
+    if (!ctrlKey && (shiftKey || Math.abs(deltaX) > Math.abs(deltaY))) return this.#move((deltaX || deltaY) / this.width);
     const [from, to] = this.window;
-    const here = from + ((turned.offsetX - PAD_PX) / this.width) * (to - from);
-    this.#zoomAt(here, turned.deltaY > 0 ? 1.25 : 0.8);
+    return this.#zoomAt(from + ((offsetX - PAD_PX) / this.width) * (to - from), deltaY > 0 ? 1.25 : 0.8);
   }
 
   /** Draw a larger or a smaller part around a position. */
@@ -123,7 +131,19 @@ export class GanttView {
     this.#showWindow([from + by, to + by]);
   }
 
-  #press(pressed) {
+  /** Draw the part of the same size around a place on the map of the whole, in pixels from the left edge. */
+  #centre(x) {
+    const [from, to] = this.window;
+    const [low, high] = this.#all();
+    const middle = low + ((x - PAD_PX) / this.width) * (high - low);
+    this.#move((middle - (from + to) / 2) / (to - from));
+  }
+
+  get #isWhole() {
+    return this.#all().every((each, index) => each === this.window[index]);
+  }
+
+  press(pressed) {
     if (pressed.ctrlKey || pressed.metaKey || pressed.altKey) return;
     const [from, to] = this.window;
     const cursor = this.#position(this.event);
@@ -146,10 +166,25 @@ export class GanttView {
     return this.byTime ? this.episode.secondsAt(event) : event;
   }
 
+  /** The place of an event in what is drawn: 0 is its left end, 1 its right one. */
+  shareOf(event) {
+    const [from, to] = this.window;
+    return (this.#position(event) - from) / (to - from);
+  }
+
   /** The place of an event, in pixels from the left edge. */
   xOf(event) {
-    const [from, to] = this.window;
-    return PAD_PX + ((this.#position(event) - from) / (to - from)) * this.width;
+    return PAD_PX + this.shareOf(event) * this.width;
+  }
+
+  /** The ends of the axis, in pixels from the left edge. */
+  get ends() {
+    return [PAD_PX, PAD_PX + this.width];
+  }
+
+  /** The first and the last event of what is drawn. */
+  get shownEvents() {
+    return this.ends.map((each) => this.#eventAt(each));
   }
 
   #eventAt(x) {
@@ -189,8 +224,9 @@ export class GanttView {
     this.#drawAxis(axis, colors);
     this.#drawCursor(axis, 4, colors);
     const places = [...this.window, width, this.episode.last, this.byTime].join();
-    if (places !== this.places) this.onDraw();
+    const moved = places !== this.places;
     this.places = places;
+    if (moved) this.onDraw();
   }
 
   #drawCursor(pen, height, colors) {
@@ -219,9 +255,9 @@ export class GanttView {
   #drawAxis(pen, colors) {
     pen.fillStyle = colors.quiet;
     for (const { text, left } of this.ticks()) pen.fillText(text, left, TEXT_PX);
+    if (this.#isWhole) return;
     const [low, high] = this.#all();
     const [from, to] = this.window;
-    if (from === low && to === high) return;
     const xOf = (position) => PAD_PX + ((position - low) / (high - low)) * this.width;
     pen.globalAlpha = 0.3;
     pen.fillRect(PAD_PX, AXIS_PX - 5, this.width, 3);

@@ -1,6 +1,7 @@
 // Puts the page together: one moment, `event`, that the tree, the scene, the chart and the panels show.
 
 import { Bodies, pathsOf } from "./bodies.js";
+import { CurvesView } from "./curves_view.js";
 import { backTo, duration, element, recorded, strokeOf, svg } from "./dom.js";
 import { Episode, signOf } from "./episode.js";
 import { Find, testOf } from "./find.js";
@@ -19,7 +20,8 @@ const HELD_MAX = 4;
 const HELP = [
   "Space plays, in proportion to time if the axis of the chart is time. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
   "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows all of the moment and its paths, R follows the robot.",
-  "Chart: the wheel zooms, a double click shows all; while the chart has the focus, W and S zoom, A and D move, 0 shows all.",
+  "Chart: the wheel zooms, with Shift or sideways it moves, a double click shows all; the map below the axis is dragged. While the chart or a curve has the focus, W and S zoom, A and D move, 0 shows all.",
+  "Curves: they follow the chart. A name draws its curve below the chart, over the others that are chosen, one scale for each unit; a click on its legend takes it away.",
   "Tree: / finds nodes by words, or by type:PickUp object:milk robot:pr2 status:failed reason:IK text:grasp; Enter goes to the next one. The address of the page keeps the moment, the node and what was searched.",
   "Words: an episode is one recorded run of a plan. A node is one performed step of it, such as an action or a motion. An event is one fact that was stored when it happened, e12 the twelfth of the episode. A snapshot is the state of nodes, objects and robots at one moment.",
 ];
@@ -40,11 +42,12 @@ class Page {
     this.map = new MapView(part("map"), episode, this.bodies);
     this.view = this.#sceneOrMap();
     this.tree = new TreeView(part("tree"), episode, { onSelect: select });
-    this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select, onDraw: () => this.seen?.drawStrip() });
+    this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select, onDraw: () => this.#followAxis() });
+    this.curves = new CurvesView(part("curves"), episode, this.gantt, () => this.panels.redrawCurves());
     const holders = { strip: part("strip"), inset: part("seen"), dialog: part("picture") };
     this.seen = new SeenView(holders, episode, { xOf: (event) => this.gantt.xOf(event), onSeek: seek });
     const choose = (object) => this.choose(object);
-    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select, onChoose: choose, similar });
+    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select, onChoose: choose, similar, curves: this.curves });
     this.find = new Find(part("find"), {
       onQuery: (query) => this.search(query),
       onStep: (step) => this.#nextMatch(step),
@@ -219,6 +222,13 @@ class Page {
     this.show();
   }
 
+  /** Draw what stands on the axis of the chart where its events have other places. */
+  #followAxis() {
+    this.seen?.drawStrip();
+    this.curves?.draw();
+    this.panels?.redrawCurves();
+  }
+
   #changeAxis() {
     this.gantt.setAxis(!this.gantt.byTime);
     this.axis.textContent = this.gantt.byTime ? "by time" : "by event";
@@ -362,6 +372,7 @@ class Page {
     if (this.following) this.tree.follow(running);
     this.tree.show(event, running, { selected: this.selected });
     this.gantt.show(event, this.selected);
+    this.curves.show(event);
     this.panels.show(event, this.selected, running);
     this.slider.value = event;
     this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}${this.playback.shortened ? " · pauses cut" : ""}`;

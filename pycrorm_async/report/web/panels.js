@@ -1,7 +1,7 @@
 // Shows what belongs to a node or to the moment: details, failures by reason, percepts, observations, states.
 
-import { armOf, differencesOf, extremes, failureGroups, lastUpTo, outcomesText, signOf } from "./episode.js";
-import { duration, element, recorded, replaceIn, svg } from "./dom.js";
+import { armOf, differencesOf, failureGroups, lastUpTo, outcomesText, signOf } from "./episode.js";
+import { duration, element, recorded, replaceIn } from "./dom.js";
 import { similarTo } from "./similar.js";
 
 const LISTED_MAX = 200;
@@ -22,8 +22,8 @@ const unsigned = (text) => (Number(text) === 0 ? text.replace("-", "") : text);
 const yawOf = ([x, y, z, w]) => (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) * 180) / Math.PI;
 
 export class Panels {
-  constructor(holder, episode, { onSeek, onSelect, onChoose, similar }) {
-    Object.assign(this, { holder, episode, onSeek, onSelect, onChoose, similar, chosen: null });
+  constructor(holder, episode, { onSeek, onSelect, onChoose, similar, curves }) {
+    Object.assign(this, { holder, episode, onSeek, onSelect, onChoose, similar, curves, chosen: null });
     this.bar = element("div", { class: "tabs", role: "tablist" });
     this.body = element("div", { class: "panel", id: "panel", role: "tabpanel", tabindex: 0 });
     this.bar.addEventListener("keydown", (pressed) => this.#press(pressed));
@@ -42,7 +42,7 @@ export class Panels {
       ["detections", "Percepts", detections.length, () => this.#detections()],
       ["attachments", "Attachments", attachments.length, () => this.#attachments()],
       ["observations", "Observations", observations.length, () => this.#observations()],
-      ["states", "Curves", curves, () => this.#curves()],
+      ["states", "Curves", curves, () => this.curves.figures()],
     ].filter(([name, , count]) => count === null || count > 0 || name === "failures");
   }
 
@@ -93,7 +93,14 @@ export class Panels {
     this.#draw();
   }
 
+  /** Draw the curves again, if they are shown: other ones are chosen, or another part of the axis is drawn. */
+  redrawCurves() {
+    cancelAnimationFrame(this.drawing);
+    if (this.current === "states") this.drawing = requestAnimationFrame(() => this.#draw());
+  }
+
   #draw() {
+    cancelAnimationFrame(this.drawing);
     if (this.event === undefined) return;
     const [, , , content] = this.tabs.find(([name]) => name === this.current);
     replaceIn(this.body, ...content());
@@ -282,40 +289,5 @@ export class Panels {
     const row = ({ at, name, values, node }) =>
       element("p", {}, this.#moment(at), " ", recorded(name, { class: "name" }), " ", recorded(values.replace(CONTENT, "$1 of $2 bytes")), " ", this.#node(node));
     return this.#around(this.episode.observations, row, this.episode.unlisted.observations);
-  }
-
-  #curves() {
-    const { episode } = this;
-    const named = [...episode.series].map(([name, track]) => [name, track]);
-    for (const [id, channels] of episode.samples) {
-      for (const [name, track] of channels) named.push([`${episode.nameOf(id)} ${name}`, track, episode.unitOf(id, name)]);
-    }
-    const moving = named.filter(([, track]) => new Set(track.values).size > 1);
-    const shown = moving.slice(0, 60).map((each) => this.#curve(...each));
-    const left = named.length - shown.length;
-    const note = left > 0 ? [element("p", { class: "quiet" }, `${left} more have one value only or are not shown.`)] : [];
-    return [element("div", { class: "curves" }, ...shown), ...note];
-  }
-
-  #curve(name, track, unit = "") {
-    const { first, last } = this.episode;
-    const [width, height] = [220, 46];
-    const low = track.values.reduce((one, other) => Math.min(one, other), Infinity);
-    const high = track.values.reduce((one, other) => Math.max(one, other), -Infinity);
-    const x = (event) => ((event - first) / Math.max(last - first, 1)) * width;
-    const y = (value) => height - 3 - ((value - low) / (high - low || 1)) * (height - 6);
-    let path = "";
-    const drawn = track.at.length > 1000 ? extremes(track.values, 1000) : track.at.keys();
-    for (const index of drawn) {
-      const here = `${x(track.at[index]).toFixed(1)},${y(track.values[index]).toFixed(1)}`;
-      path += index === 0 ? `M${here}` : `H${here.split(",")[0]}V${here.split(",")[1]}`;
-    }
-    path += `H${width}`;
-    const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "curve", preserveAspectRatio: "none", "aria-hidden": "true" });
-    picture.append(svg("path", { d: path }), svg("line", { x1: x(this.event), x2: x(this.event), y1: 0, y2: height }));
-    const short = (number) => String(Number(Number(number).toPrecision(4)));
-    const value = `${short(track.valueAt(this.event))} ${unit}`;
-    const range = element("span", { class: "range" }, `${short(low)} to ${short(high)} ${unit}`);
-    return element("figure", {}, element("figcaption", {}, recorded(name), element("b", {}, value)), picture, range);
   }
 }
