@@ -24,53 +24,70 @@ export function entriesOf(episodes) {
   );
 }
 
-/** The episodes that ended, and of which it is known how. */
-export const ended = (episodes) => episodes.filter(({ status }) => status !== "RUNNING" && status !== "UNKNOWN");
-
-/** Successes and tries of episodes; of the actions of one type in them, if it is given. */
+/** Successes and tries of episodes that ended, and of which it is known how; of the actions of one type in them, if it is given. */
 export function triesOf(episodes, type = "") {
-  if (type === "") {
-    const all = ended(episodes);
-    return [all.filter(({ status }) => status === "SUCCEEDED").length, all.length];
-  }
-  const sum = [0, 0];
-  for (const { actions } of episodes) {
-    for (const [name, [good, tries]] of actions) {
-      if (name !== type) continue;
-      sum[0] += good;
-      sum[1] += tries;
+  let [succeeded, all] = [0, 0];
+  for (const { status, actions } of episodes) {
+    if (type === "") {
+      succeeded += status === "SUCCEEDED";
+      all += status !== "RUNNING" && status !== "UNKNOWN";
+    } else {
+      for (const [name, [good, tries]] of actions) {
+        if (name !== type) continue;
+        succeeded += good;
+        all += tries;
+      }
     }
   }
-  return sum;
+  return [succeeded, all];
 }
 
 /** The median duration of episodes in seconds, or the mean one of the actions of a type in them; null without any. */
 export function secondsOf(episodes, type = "") {
-  if (type === "") return shareOf(episodes.map(({ seconds }) => seconds), 0.5);
-  const [count, seconds] = actionsOf(episodes).get(type)?.slice(2) ?? [0, 0];
+  if (type === "") return shareOf(sortedSeconds(episodes), 0.5);
+  let [count, seconds] = [0, 0];
+  for (const { actions } of episodes) {
+    for (const [name, counts] of actions) {
+      if (name !== type) continue;
+      count += counts[2];
+      seconds += counts[3];
+    }
+  }
   return count > 0 ? seconds / count : null;
 }
 
-/** The number below which a share of these numbers is; 0.5 is the median. */
-export function shareOf(numbers, share) {
-  const sorted = Float64Array.from(numbers.filter((each) => each !== null)).sort(); // four times as fast as of an array
+/** The known durations of episodes in ascending order. */
+export function sortedSeconds(episodes) {
+  const seconds = [];
+  for (const each of episodes) if (each.seconds !== null) seconds.push(each.seconds);
+  return Float64Array.from(seconds).sort(); // four times as fast as of an array
+}
+
+/** The number below which a share of these sorted numbers is; 0.5 is the median. */
+export function shareOf(sorted, share) {
   return sorted.length === 0 ? null : sorted[Math.floor((sorted.length - 1) * share + 0.5)];
 }
 
-/** Successes, tries, ended ones and their seconds of the actions, by type, the most frequent first. */
+const sumsOf = new WeakMap();
+
+/** Successes, tries, ended ones and their seconds of the actions, by type, the most frequent first; once for each list of episodes. */
 export function actionsOf(episodes) {
+  if (sumsOf.has(episodes)) return sumsOf.get(episodes);
   const sums = new Map();
   for (const { actions } of episodes) {
     for (const [type, counts] of actions) {
       const sum = sums.get(type);
       if (sum === undefined) sums.set(type, [...counts]);
-      else counts.forEach((count, index) => (sum[index] += count));
+      else for (let index = 0; index < sum.length; index++) sum[index] += counts[index];
     }
   }
-  return new Map([...sums].sort(([, one], [, other]) => other[1] - one[1]));
+  const sorted = new Map([...sums].sort(([, one], [, other]) => other[1] - one[1]));
+  sumsOf.set(episodes, sorted);
+  return sorted;
 }
 
-export const causeName = ([reason, type, object]) => [reason, type, object].filter(Boolean).join(CAUSE_SEPARATOR);
+/** The name of a cause, which keeps it: causes are counted again at each choice of episodes. */
+export const causeName = (cause) => (cause.name ??= cause.slice(0, 3).filter(Boolean).join(CAUSE_SEPARATOR));
 
 /** The causes of failures by name, the most frequent first: count, counts by outcome, and [episode, event] of each first one. */
 export function causesOf(episodes) {
@@ -79,8 +96,8 @@ export function causesOf(episodes) {
     for (const cause of episode.causes) {
       const [reason, type, object, outcome, count, event] = cause;
       const name = causeName(cause);
-      if (!causes.has(name)) causes.set(name, { name, reason, type, object, count: 0, outcomes: new Map(), at: [] });
-      const sum = causes.get(name);
+      let sum = causes.get(name);
+      if (sum === undefined) causes.set(name, (sum = { name, reason, type, object, count: 0, outcomes: new Map(), at: [] }));
       sum.count += count;
       sum.outcomes.set(outcome, (sum.outcomes.get(outcome) ?? 0) + count);
       if (sum.at.at(-1)?.[0] !== episode) sum.at.push([episode, event]);

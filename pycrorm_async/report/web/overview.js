@@ -1,6 +1,6 @@
 // Shows many episodes: how often they succeed and for how long, why they fail, and a table that leads to their pages.
 
-import { actionsOf, causesOf, entriesOf, secondsOf, shareOf, triesOf } from "./counts.js";
+import { actionsOf, causesOf, entriesOf, shareOf, sortedSeconds, triesOf } from "./counts.js";
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { signOf } from "./episode.js";
 import { Filters, Settings } from "./filters.js";
@@ -101,7 +101,8 @@ class Overview {
     this.chosen = this.filters.chosen(episodes);
     const { chosen } = this;
     const [good, tries] = triesOf(chosen);
-    const middle = secondsOf(chosen);
+    this.seconds = sortedSeconds(chosen);
+    const middle = shareOf(this.seconds, 0.5);
     const count = `${chosen.length} episode${chosen.length === 1 ? "" : "s"}`;
     const facts = [
       chosen.length < episodes.length ? `${count} of ${episodes.length}` : count,
@@ -152,7 +153,7 @@ class Overview {
 
   /** How many episodes took how long. */
   #durations() {
-    const seconds = this.chosen.map((each) => each.seconds).filter((each) => each !== null);
+    const { seconds } = this;
     const [least, most] = [shareOf(seconds, 0), shareOf(seconds, 1)];
     if (seconds.length < 2 || least === most) return part("durations").replaceChildren();
     const scale = least > 0 && most > SPREAD * least ? Math.log : (each) => each;
@@ -178,10 +179,10 @@ class Overview {
   /** Why actions failed, with links to the newest episodes in which they did. */
   #causes() {
     const causes = causesOf(this.chosen);
-    const binOf = new Map(this.bins.flatMap((bin, index) => bin.map((each) => [each, index])));
+    this.bins.forEach((bin, index) => bin.forEach((each) => (each.bin = index)));
     const rows = causes.slice(0, CAUSES_MAX).map((cause) => {
       const trend = this.bins.map(() => 0);
-      for (const [episode] of cause.at) trend[binOf.get(episode)] += 1;
+      for (const [episode] of cause.at) trend[episode.bin] += 1;
       const picture = this.bins.length > 1 ? bars(trend, Math.max(...trend), `${cause.name}: episodes over time`, String) : "";
       const outcomes = [...cause.outcomes].filter(([name]) => name !== "open" && name !== "").sort(([, one], [, other]) => other - one);
       const after = element("span", { class: "quiet" }, outcomes.map(([name, number]) => ` ${number} ${name}`).join(","));
@@ -210,10 +211,8 @@ class Overview {
       const order = by === key ? (down ? "descending" : "ascending") : null;
       return element("th", { scope: "col", "aria-sort": order }, element("button", sort, `${title}${sign}`));
     });
-    const order = down ? -1 : 1;
-    const valueOf = (each) => (Array.isArray(each[by]) ? each[by].join() : each[by] ?? -1);
-    const sorted = this.chosen.map((each) => [valueOf(each), each]).sort(([one], [other]) => (one < other ? -1 : one > other ? 1 : 0) * order);
-    const rows = sorted.slice(0, this.rows).map(([, each]) => this.#row(each));
+    const sorted = this.#sorted(by, down);
+    const rows = sorted.slice(0, this.rows).map((each) => this.#row(each));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows));
     const left = sorted.length - rows.length;
     const more = element("button", { type: "button", onclick: () => this.#listMore() }, `list ${Math.min(left, this.rows)} more of ${left}`);
@@ -222,6 +221,16 @@ class Overview {
     const text = `${missing.length} older episodes have no page here. One of them gets a page of its own by `;
     const none = rows.length === 0 ? element("p", { class: "quiet" }, this.episodes.length > 0 ? "No episode fulfils all conditions." : "There is no episode yet.") : "";
     replaceIn(part("episodes"), element("h2", {}, "Episodes"), rows.length > 0 ? table : none, left > 0 ? more : "", missing.length > 0 ? element("p", { class: "quiet" }, text, command) : "");
+  }
+
+  /** The chosen episodes in the order of a column; they are in that of their numbers. */
+  #sorted(by, down) {
+    const { chosen } = this;
+    if (by === "number") return down ? [...chosen].reverse() : chosen;
+    const order = down ? -1 : 1;
+    const valueOf = (each) => (Array.isArray(each[by]) ? each[by].join() : each[by] ?? -1);
+    const keyed = chosen.map((each) => [valueOf(each), each]).sort(([one], [other]) => (one < other ? -1 : one > other ? 1 : 0) * order);
+    return keyed.map(([, each]) => each);
   }
 
   #listMore() {
