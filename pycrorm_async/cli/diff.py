@@ -14,7 +14,7 @@ import typer
 from pycrorm_async.cli.output import Form, counted, note, print_json, print_line, print_table, stdout
 from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.episode_diff import Parting, partings
+from pycrorm_async.query.episode_diff import Parting, align_runs
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.text import duration
 
@@ -31,26 +31,28 @@ def diff(
     ] = None,
     sql: Annotated[bool, typer.Option("--sql", help="Print the SQL of the rows that are compared.")] = False,
     html: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write two as a page: aligned trees, two scenes.")
+        Path | None, typer.Option("--html", metavar="FILE", help="Write a page: aligned trees, of two also scenes.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file of --html if it exists.")] = False,
 ) -> None:
     """Compare two episodes: their circumstances, their task trees, and the last places of their objects.
 
     Nodes correspond by the types from the root down. A node that only one episode has is listed without its children.
-    Of more than two episodes, such as ten runs of one plan, it lists the nodes that ended in several ways.
+    Of more than two episodes, such as ten runs of one plan, it lists the nodes that ended in several ways and names the
+    first one, which follows from no other. As a page they have the pages of the episodes in a folder beside it.
     SQL reads the rows (`--sql`); the comparison is made in Python.
     """
-    if others:
-        if sql or html is not None:
-            raise CallerError(f"{'--sql' if sql else '--html'} compares two episodes: name two")
-        _print_partings(place.read(lambda reading: partings(reading, [first, second, *others])), form)
-        return
+    if others and sql:
+        raise CallerError("--sql compares two episodes: name two")
+    episodes = [first, second, *(others or [])]
     if html is not None:
         from pycrorm_async.report.comparison import write_comparison  # here, because it loads numpy and recall
 
-        file = place.read(lambda reading: write_comparison(reading, first, second, html, force=force))
+        file = place.read(lambda reading: write_comparison(reading, episodes, html, force=force))
         print_json({"file": file, "bytes": file.stat().st_size}) if form.as_json else print_line(file)
+        return
+    if others:
+        _print_partings(place.read(lambda reading: align_runs(reading, episodes)).partings, form)
         return
     compared = place.read(lambda reading: reading.diff(first, second))
     if sql:
@@ -83,7 +85,8 @@ def _print_partings(parted: Sequence[Parting], form: Form) -> None:
     rows = [(each.where, f"{each.otherwise} of {each.runs}", each.text) for each in parted]
     if rows or not form.is_table:
         print_table("Where the episodes part", ("where", "otherwise", "ended"), rows, as_csv=form.as_csv)
-    note(f"{counted(len(rows), 'node')} that ended in several ways")
+    first = "".join(f"; first {each.where}" for each in parted if each.first)
+    note(f"{counted(len(rows), 'node')} that ended in several ways{first}")
 
 
 def _line(episode: EpisodeSummary) -> str:

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import zip_longest
 from typing import Any, TypeAlias
 
 import msgspec
@@ -106,11 +108,13 @@ class Parting:
         where: the node's path.
         runs: number of the runs in which the node around it was.
         outcomes: the episodes by the status and reason of the node, or `not started`, the most frequent outcome first.
+        first: True for the first parting below which there is none: later and outer ones may follow from it.
     """
 
     where: str
     runs: int
     outcomes: Mapping[str, tuple[int, ...]]
+    first: bool = False
 
     @property
     def otherwise(self) -> int:
@@ -125,39 +129,97 @@ class Parting:
         return "; ".join([f"{len(self.outcomes[usual])} {usual}", *named])
 
 
-async def partings(reading: EpisodeReader, episodes: Sequence[AskedEpisode]) -> list[Parting]:
-    """Return the nodes at which runs of one plan part, in the order of the tree; nodes correspond as in a diff.
+@dataclass(frozen=True)
+class AlignedNode:
+    """A node of the trees of several runs, which correspond by their paths.
 
-    A node that misses in a run with all around it is not listed for that run. Raises `UnknownEpisode`.
+    Attributes:
+        nodes: the node in each run that has the node around it, by the number of the episode; None where it misses.
     """
-    runs = [await reading.episode(episode_name(each)) for each in episodes]
-    by_number = {each.number: _by_path(await reading.tree(each)) for each in runs}
-    listed = []
-    for path in _united(by_number.values()):
+
+    path: _Path
+    nodes: Mapping[int, NodeSummary | None]
+
+    @property
+    def name(self) -> str:
+        return _nth_text(*self.path[-1])
+
+    @cached_property
+    def outcomes(self) -> dict[str, tuple[int, ...]]:
+        """The episodes by the outcome of the node, the most frequent outcome first."""
         outcomes: dict[str, list[int]] = {}
-        for number, nodes in by_number.items():
-            if len(path) == 1 or path[:-1] in nodes:
-                node = nodes.get(path)
-                reason = f" ({node.reason})" if node is not None and node.reason else ""
-                outcomes.setdefault(f"{node.status}{reason}" if node is not None else "not started", []).append(number)
-        if len(outcomes) > 1:
-            sorted_outcomes = sorted(outcomes.items(), key=lambda each: -len(each[1]))
-            numbers = {outcome: tuple(each) for outcome, each in sorted_outcomes}
-            listed.append(Parting(_path_text(path), sum(map(len, numbers.values())), numbers))
-    return listed
+        for number, node in self.nodes.items():
+            outcomes.setdefault(outcome_text(node), []).append(number)
+        return {outcome: tuple(each) for outcome, each in sorted(outcomes.items(), key=lambda each: -len(each[1]))}
 
 
-def _united(trees: Iterable[Mapping[_Path, NodeSummary]]) -> list[_Path]:
-    """Return the paths of all trees; one that earlier trees lack comes behind that before it in its own tree."""
-    places: dict[_Path, tuple[int, ...]] = {}
-    for number, nodes in enumerate(trees):
-        before: tuple[int, ...] = ()
-        for index, path in enumerate(nodes):
-            if path in places:
-                before = places[path]
-            else:
-                places[path] = (*before, number, index)
-    return sorted(places, key=places.__getitem__)
+def outcome_text(node: NodeSummary | None) -> str:
+    if node is None:
+        return "not started"
+    return f"{node.status} ({node.reason})" if node.reason else node.status
+
+
+@dataclass(frozen=True)
+class AlignedRuns:
+    """Several runs and their trees as one, in the order of the tree."""
+
+    runs: tuple[EpisodeSummary, ...]
+    nodes: tuple[AlignedNode, ...]
+
+    @cached_property
+    def first_parting(self) -> AlignedNode | None:
+        """The first node that ended in several ways and has no such node below it."""
+        parted = [each for each in self.nodes if len(each.outcomes) > 1]
+        for each, following in zip_longest(parted, parted[1:]):
+            if following is None or following.path[: len(each.path)] != each.path:
+                return each
+        return None
+
+    @property
+    def partings(self) -> list[Parting]:
+        """The nodes that ended in several ways. One that misses in a run with all around it is not counted for it."""
+        return [
+            Parting(_path_text(each.path), len(each.nodes), each.outcomes, first=each is self.first_parting)
+            for each in self.nodes
+            if len(each.outcomes) > 1
+        ]
+
+
+async def align_runs(reading: EpisodeReader, episodes: Sequence[AskedEpisode]) -> AlignedRuns:
+    """Align the trees of several runs of one plan; nodes correspond as in a diff. Raises `UnknownEpisode`."""
+    runs = {each.number: each for each in [await reading.episode(episode_name(each)) for each in episodes]}
+    by_number = {number: _by_path(await reading.tree(each)) for number, each in runs.items()}
+    nodes = [
+        AlignedNode(
+            path,
+            {number: tree.get(path) for number, tree in by_number.items() if len(path) == 1 or path[:-1] in tree},
+        )
+        for path in _united(by_number.values())
+    ]
+    return AlignedRuns(tuple(runs.values()), tuple(nodes))
+
+
+def _united(trees: Iterable[Iterable[_Path]]) -> list[_Path]:
+    """Return the paths of all trees, each before those below it.
+
+    A path that earlier trees lack comes behind the sibling that is before it in its own tree.
+    """
+    children: dict[_Path, list[_Path]] = {(): []}
+    for paths in trees:
+        places: dict[_Path, int] = {}  # behind the last sibling, by parent
+        for path in paths:
+            siblings, place = children[path[:-1]], places.get(path[:-1], 0)
+            if path not in children:
+                children[path] = []
+                siblings.insert(place, path)
+            elif siblings[place : place + 1] != [path]:
+                place = siblings.index(path)
+            places[path[:-1]] = place + 1
+    united, stack = list[_Path](), children[()][::-1]
+    while stack:
+        united.append(stack.pop())
+        stack += reversed(children[united[-1]])
+    return united
 
 
 # --- facts ----------------------------------------------------------------------------------------------------

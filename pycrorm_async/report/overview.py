@@ -70,21 +70,17 @@ async def overview(
     folder = file.with_name(f"{file.stem}.pages") if is_page else file
     refuse_existing(file, force=force, folder=not is_page)
     file = file if is_page else folder / "index.html"
-    if folder.exists() and not (force and folder.is_dir()):
-        raise errors.CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
     choice = choice or EpisodeChoice()
     episodes, total = await newest_episodes(reading, choice)
     if not episodes:
         raise errors.CallerError(await absence_of_episodes(reading, choice))
     title = f"Episodes: {choice}" if str(choice) else "Episodes"
     successes = await success_documents(reading, [each.number for each in episodes], plots)
-    with _folder_of_pages(folder):
+    with folder_of_pages(folder, force=force):
         shown = episodes[-_PAGES_MAX:]
         back = f"../{quote(file.name)}" if is_page else file.name
-        unreadable = await _write_pages(reading, shown, folder, back, force=force, images=images)
+        unreadable = await write_pages(reading, shown, folder, back, force=force, images=images)
         shown = [each for each in shown if each.number not in unreadable]
-        if unreadable:  # again, because some pages may link to those that are missing
-            await _write_pages(reading, shown, folder, back, force=True, images=images)
         below = f"{quote(folder.name)}/" if is_page else ""
         pages = {each.number: f"{below}{page_name(each.number)}" for each in shown}
         document = await overview_document(reading, title, episodes, total, pages, unreadable)
@@ -94,9 +90,14 @@ async def overview(
 
 
 @contextmanager
-def _folder_of_pages(folder: Path) -> Iterator[None]:
-    """Make the folder if it does not exist; delete it again, with its pages, if an error leaves the block."""
+def folder_of_pages(folder: Path, *, force: bool) -> Iterator[None]:
+    """Make the folder if it does not exist; delete it again, with its pages, if an error leaves the block.
+
+    Raises `CallerError` if it exists, without `force`.
+    """
     is_new = not folder.exists()
+    if not is_new and not (force and folder.is_dir()):
+        raise errors.CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
     folder.mkdir(exist_ok=True)
     try:
         yield
@@ -106,14 +107,14 @@ def _folder_of_pages(folder: Path) -> Iterator[None]:
         raise
 
 
-async def _write_pages(
+async def write_pages(
     reading: Reading,
     episodes: Collection[EpisodeSummary],
     folder: Path,
     back: str,
     *,
     force: bool,
-    images: Images,
+    images: Images = "thumbs",
 ) -> dict[int, str]:
     """Write a page of each episode, with links to each other and `back`; return why some have none, by number."""
     unreadable: dict[int, str] = {}
@@ -128,6 +129,9 @@ async def _write_pages(
             raise
         except Exception as error:  # noqa: BLE001  whatever an episode holds, the others get their pages
             unreadable[each.number] = f"its page cannot be made: {type(error).__name__}: {error}"
+    if unreadable:  # again, because some pages may link to those that are missing
+        readable = [each for each in episodes if each.number not in unreadable]
+        await write_pages(reading, readable, folder, back, force=True, images=images)
     return unreadable
 
 

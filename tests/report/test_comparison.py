@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
+from pycrorm_async.query.episode_diff import _united
 from pycrorm_async.visible_text import visible
 from pycrorm_async.world.pose import Pose
 from tests.report.browser import Browser
@@ -103,14 +104,112 @@ def test_more_episodes_are_the_nodes_at_which_they_part(url: str) -> None:
     ]
     shown = diff(url, 1, 2, 3, 4)[1]
     assert "2 of 4" in shown
+    assert shown.endswith("\n4 nodes that ended in several ways; first root > TakeAction > Look\n")
+    assert [each["where"] for each in json.loads(text) if each["first"]] == ["root > TakeAction > Look"]
     assert diff(url, 1, 3, 1)[1] == "0 nodes that ended in several ways\n"
+
+
+def test_nodes_of_more_runs_are_in_the_order_of_the_tree() -> None:
+    first = [(), "a", "ax", "aw", "b"]
+    trees = [first, [(), "a", "ax", "f"], [(), "c", "cy", "a", "ay", "aw", "b", "bz"], first]
+    paths = [[tuple((name, 1) for name in f"r{''.join(each)}") for each in tree] for tree in trees]
+    united = ["".join(name for name, _ in path) for path in _united(paths)]
+    assert united == ["r", "rc", "rcy", "ra", "ray", "rax", "raw", "rf", "rb", "rbz"]
+
+
+@pytest.mark.slow
+def test_both_scenes_are_played_on_one_clock(chrome: Browser, url: str, tmp_path: Path) -> None:
+    page = tmp_path / "diff.html"
+    assert diff(url, 1, 2, "--html", page)[0] == 0
+    note = """const { onEvent } = pycrormComparison.playback; globalThis.shown = [];
+      pycrormComparison.playback.onEvent = (index) => { onEvent(index);
+        shown.push([pycrormComparison.seconds,
+          ...[...document.querySelectorAll('.twin > .hint')].map(
+            (each) => Number(each.textContent.split('event ')[1]))]); }; 0"""
+    times = "pycrormComparison.sides.map(({ episode }) => episode.times)"
+    with chrome.open(page) as tab:
+        tab.ask(note)
+        button = "document.querySelector('#controls button')"
+        assert tab.ask(f"[{button}.getAttribute('aria-label'), document.activeElement.tagName]") == ["play", "BODY"]
+        tab.press(" ")
+        assert tab.ask(f"[{button}.getAttribute('aria-label'), {button}.textContent]") == ["pause", "❚❚"]
+        tab.wait_for("shown.length > 2")
+        tab.press(" ")
+        assert tab.ask(f"[{button}.getAttribute('aria-label'), pycrormComparison.playback.running]") == ["play", False]
+        paused = tab.ask("pycrormComparison.seconds")
+        tab.ask(
+            f"{button}.click(); pycrormComparison.slider.value = 900; "
+            "pycrormComparison.slider.dispatchEvent(new Event('input'))"
+        )  # it goes on from there
+        tab.wait_for("!pycrormComparison.playback.running")
+        shown, (first, second) = tab.ask("shown"), tab.ask(times)
+        assert [each[0] for each in shown] == sorted(each[0] for each in shown)
+        assert shown[-1][0] == tab.ask("pycrormComparison.longest") > paused
+        assert not any(paused < each[0] < 0.9 * shown[-1][0] for each in shown)
+        for seconds, *events in shown:
+            for event, side in zip(events, (first, second), strict=True):
+                assert event == sum(each <= seconds * 1e6 + 1 for each in side)
+        assert tab.ask(f"{button}.getAttribute('aria-label')") == "play"
+        tab.ask(f"{button}.focus()")
+        tab.press(" ")  # the browser presses a focused button itself: once, and not twice
+        assert tab.ask("[pycrormComparison.playback.running, pycrormComparison.seconds < 1]") == [True, True]
+        tab.ask("document.querySelector('#nodes .link').click()")
+        assert not tab.ask("pycrormComparison.playback.running")
+        assert tab.problems() == []
+
+
+@pytest.mark.slow
+def test_the_page_of_more_runs_counts_their_ways_marks_the_first_parting_and_leads_to_each(
+    chrome: Browser, url: str, tmp_path: Path
+) -> None:
+    page = tmp_path / "four runs.html"
+    assert diff(url, 1, 2, 3, 4, "--html", page) == (0, f"{page}\n")
+    folder = tmp_path / "four runs.pages"
+    assert sorted(each.name for each in folder.iterdir()) == [f"episode-{each}.html" for each in (1, 2, 3, 4)]
+    rows = """[...document.querySelectorAll('#nodes tbody tr')].map((each) =>
+      [...each.querySelectorAll('bdi.name, .mark, .way, td.run')].map((part) => part.textContent))"""
+    slipped = f"FAILED (slipped {visible(HOSTILE.replace('1', '#'))})"
+    none = "\N{EN DASH}"
+    parted = [
+        ["TakeAction", "✓2 SUCCEEDED", "✗2 FAILED (not taken) 2 4", *"✓✗✓✗"],
+        ["Look", "they part here first", f"{none}2 not started", "✓2 SUCCEEDED 2 4", none, "✓", none, "✓"],
+        ["Grip", "✓3 SUCCEEDED", f"✗1 {slipped} 2", *"✓✗✓✓"],
+        ["Lift", "✓2 SUCCEEDED", f"{none}1 not started 2", "✗1 FAILED (too heavy) 4", "✓", none, *"✓✗"],
+    ]
+    for width in (1400, 390):
+        with chrome.open(page, width=width) as tab:
+            root, *others = tab.ask(rows)
+            assert root == ["root", "✓4 SUCCEEDED", *"✓✓✓✓"]
+            assert others == parted
+            facts = "[...document.querySelectorAll('#facts span')].map((each) => each.textContent)"
+            assert tab.ask(facts) == ["4 of 4 runs succeeded", "they part first at root > TakeAction > Look"]
+            runs = "[...document.querySelectorAll('#runs tbody tr')].map((each) => each.children[4].textContent)"
+            assert tab.ask(runs) == ["nowhere", "root > TakeAction > Look", "nowhere", "root > TakeAction > Look"]
+            assert tab.ask("document.documentElement.scrollWidth") == width
+            tab.ask("document.querySelector('[data-key=all]').focus()")
+            tab.press(" ")
+            assert [each[0] for each in tab.ask(rows)] == ["root", "TakeAction", "Look", "Reach", "Grip", "Lift"]
+            assert tab.ask("document.activeElement.dataset.key") == "all"
+            assert tab.problems() == []
+            tab.ask("document.querySelectorAll('#nodes tbody tr')[4].querySelector('.way a').click()")  # Grip of 2
+            tab.wait_for("globalThis.pycrormPage !== undefined")
+            assert tab.ask("[pycrormPage.episode.number, pycrormPage.selected.name]") == [2, "Grip"]
+            tab.ask("document.querySelector('#facts a').click()")
+            tab.wait_for("globalThis.pycrormRuns !== undefined")
+    assert diff(url, 1, 2, 3, "--html", page)[0] == 2
+    assert diff(url, *[1, 3] * 3, "--html", page, "--force") == (0, f"{page}\n")
+    with chrome.open(page) as tab:
+        assert tab.ask("document.querySelector('#nodes p').textContent") == "All runs ended alike at every node."
+        assert tab.problems() == []
 
 
 def test_a_page_that_cannot_be_written_is_one_line(url: str, tmp_path: Path) -> None:
     for arguments, message in (
         ((1, 9, "--html", tmp_path / "a.html"), "there is no episode '9' (`pycrorm episodes` lists all 5)"),
         ((1, 2, "--html", tmp_path), f"{tmp_path} is a folder: give the name of a file in it"),
-        ((1, 2, 3, "--html", tmp_path / "a.html"), "--html compares two episodes: name two"),
+        ((1, 2, 3, "--sql"), "--sql compares two episodes: name two"),
+        ((1, 2, 9, "--html", tmp_path / "a.html"), "there is no episode '9'"),
+        ((1, 2, 3, "--html", tmp_path / "no" / "a.html"), "does not exist: create it first"),
         ((1, 2, 99), "there is no episode '99' (`pycrorm episodes` lists all 5)"),
     ):
         code, text = diff(url, *arguments)

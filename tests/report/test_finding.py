@@ -57,7 +57,11 @@ def _record(folder: Path) -> None:
     for number in (1, 2, 3):
         done = pycrorm("report", str(number), "--url", "sqlite:///fleet.db", "--out", f"{number}.html", cwd=folder)
         assert done.returncode == 0, done.stderr
-    for command in (("report", "--all", "--out", "all.html"), ("diff", "1", "3", "--html", "diff.html")):
+    for command in (
+        ("report", "--all", "--out", "all.html"),
+        ("diff", "1", "3", "--html", "diff.html"),
+        ("diff", "1", "2", "3", "--html", "runs.html"),
+    ):
         done = pycrorm(*command, "--url", "sqlite:///fleet.db", cwd=folder)
         assert done.returncode == 0, done.stderr
 
@@ -258,7 +262,7 @@ def test_axe_finds_nothing_critical_or_serious(
     names = "globalThis.pycrormPage?.panels.tabs.map(([name]) => name) ?? ['the whole']"
     opening = "globalThis.pycrormPage?.panels.open('{}')"
     serious = "axe.run().then(({ violations }) => violations.map(({ impact, id }) => [impact, id]))"
-    shown = [fleet / f"{each}.html" for each in ("1", "2", "3", "all", "diff")]
+    shown = [fleet / f"{each}.html" for each in ("1", "2", "3", "all", "diff", "runs")]
     for page in (*shown, pages["plan"]):
         fragment = "#by=robot&vs=agv-1&vs=none" if page.name == "all.html" else "#e20"
         with chrome.open(page, width=width, dark=dark, fragment=fragment) as tab:

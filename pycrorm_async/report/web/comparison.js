@@ -2,8 +2,9 @@
 
 import { Bodies } from "./bodies.js";
 import { duration, element, recorded } from "./dom.js";
-import { Episode, signOf } from "./episode.js";
+import { Episode, lastUpTo, signOf } from "./episode.js";
 import { MapView } from "./map_view.js";
+import { Playback } from "./playback.js";
 import { SceneView } from "./scene_view.js";
 
 const LETTERS = ["A", "B"];
@@ -17,55 +18,28 @@ const TEXT_MAX = 300;
 
 const part = (name) => document.getElementById(name);
 
-/** Pairs of nodes, each before those below it; a node that has no partner stands where it would be among its siblings. */
-function alignedNodes(roots, otherRoots) {
+/** The nodes of both episodes in pairs, by the events of their starts; a pair of which the page has none is left out. */
+function rowsOf(pairs, sides) {
+  const rowOf = new Map();
   const rows = [];
-  const stack = siblingPairs(roots, otherRoots, null).reverse();
-  while (stack.length > 0) {
-    const row = stack.pop();
-    row.number = rows.push(row) - 1;
-    const [children, others] = row.nodes.map((each) => each?.children ?? []);
-    for (const each of siblingPairs(children, others, row).reverse()) stack.push(each);
+  for (const starts of pairs) {
+    const nodes = starts.map((start, index) => sides[index].episode.nodeAt.get(start) ?? null);
+    const node = nodes[0] ?? nodes[1];
+    if (node === null) continue;
+    const row = { number: rows.length, nodes, depth: node.depth, parent: rowOf.get(node.parent) ?? null, marks: [], holdsMark: false };
+    rows.push(row);
+    for (const each of nodes) if (each !== null) rowOf.set(each, row);
   }
   return rows;
 }
 
-/** Siblings in pairs: those of one name correspond by their number among those of this name. */
-function siblingPairs(siblings, others, parent) {
-  const [keys, otherKeys] = [siblings, others].map(namesInOrder);
-  const places = new Map(otherKeys.map((key, index) => [key, index]));
-  const own = new Set(keys);
-  const pairs = [];
-  let next = 0;
-  const depth = parent === null ? 0 : parent.depth + 1;
-  const add = (one, other) => pairs.push({ nodes: [one, other], depth, parent, marks: [], holdsMark: false });
-  const addOthersTo = (end) => {
-    for (; next < end; next++) if (!own.has(otherKeys[next])) add(null, others[next]);
-  };
-  keys.forEach((key, index) => {
-    const place = places.get(key);
-    if (place !== undefined) addOthersTo(place);
-    add(siblings[index], place === undefined ? null : others[place]);
-  });
-  addOthersTo(others.length);
-  return pairs;
-}
-
-function namesInOrder(siblings) {
-  const times = new Map();
-  return siblings.map(({ name }) => {
-    times.set(name, (times.get(name) ?? 0) + 1);
-    return `${name} ${times.get(name)}`;
-  });
-}
-
 class Comparison {
-  constructor({ episodes, took, differences }) {
+  constructor({ episodes, nodes, took, differences }) {
     this.sides = episodes.map((each, index) => new Side(new Episode(each), index));
     this.took = took;
     this.all = false;
     this.longest = Math.max(1e-6, ...this.sides.map(({ episode }) => episode.secondsAt(episode.last)));
-    this.rows = alignedNodes(...this.sides.map(({ episode }) => episode.roots));
+    this.rows = rowsOf(nodes, this.sides);
     for (const each of this.rows) this.#mark(each);
     this.#head();
     this.#controls();
@@ -109,21 +83,54 @@ class Comparison {
   }
 
   #controls() {
+    this.moments = [...new Set(this.sides.flatMap(({ episode }) => episode.times))].sort((one, other) => one - other);
+    this.playback = new Playback({ onEvent: (index) => this.seek(this.moments[index] / 1e6), onEnd: () => this.#namePlay() });
+    this.play = element("button", { type: "button", title: "play (space)", "aria-label": "play", onclick: () => this.togglePlay() }, "▶");
     this.slider = element("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": "time since the start of both" });
-    this.slider.addEventListener("input", () => this.seek((Number(this.slider.value) / STEPS) * this.longest));
+    this.slider.addEventListener("input", () => {
+      const seconds = (Number(this.slider.value) / STEPS) * this.longest;
+      if (this.playback.running) this.#start(seconds);
+      else this.seek(seconds);
+    });
     this.clock = element("output", { class: "clock" });
-    part("controls").append(this.slider, this.clock);
+    part("controls").append(this.play, this.slider, this.clock);
+    addEventListener("keydown", (pressed) => {
+      if (pressed.key !== " " || pressed.target instanceof HTMLButtonElement) return;
+      pressed.preventDefault();
+      this.togglePlay();
+    });
+  }
+
+  togglePlay() {
+    if (this.playback.running) this.playback.stop();
+    else this.#start(this.seconds < this.longest ? this.seconds : 0);
+    this.#namePlay();
+  }
+
+  /** Play the moments of both episodes from one on, in proportion to time. */
+  #start(seconds) {
+    this.seek(seconds);
+    const last = this.moments.length - 1;
+    if (last > 0) this.playback.start(0, Math.max(0, lastUpTo(this.moments, seconds * 1e6 + 0.5)), last, this.moments, true);
+  }
+
+  #namePlay() {
+    const { running } = this.playback;
+    this.play.textContent = running ? "❚❚" : "▶";
+    this.play.setAttribute("aria-label", running ? "pause" : "play");
   }
 
   /** Show both scenes so many seconds after their starts. */
   seek(seconds) {
+    this.seconds = seconds;
     for (const each of this.sides) each.show(each.episode.eventAt(seconds));
     this.slider.value = (seconds / this.longest) * STEPS;
-    this.clock.textContent = `${duration(seconds)} since the start of both`;
+    this.clock.textContent = `${duration(seconds)} since the start of both${this.playback.shortened ? " · pauses cut" : ""}`;
   }
 
   /** Show the end of a node in each scene, at the times when it came. */
   #select(row) {
+    if (this.playback.running) this.togglePlay();
     row.nodes.forEach((node, index) => node !== null && this.sides[index].show(node.lastEvent));
     this.clock.replaceChildren("at the end of ", recorded((row.nodes[0] ?? row.nodes[1]).name));
     this.selected = row;
@@ -166,7 +173,7 @@ class Comparison {
     const seconds = this.#secondsOf(node);
     const took = Number.isNaN(seconds) ? "" : `\u00a0${duration(seconds).replace(" ", "\u00a0")}`;
     const sign = element("span", { class: "sign", title: node.status }, signOf(node.status));
-    return element("td", { class: `is-${node.status.toLowerCase()}` }, sign, took, node.reason ? recorded(` ${node.reason}`, { class: "reason" }) : null);
+    return element("td", { class: `is-${node.status.toLowerCase()}` }, element("span", { class: "fixed" }, sign, took), node.reason ? recorded(` ${node.reason}`, { class: "reason" }) : null);
   }
 
   /** Facts and places of objects that differ. */
@@ -175,7 +182,7 @@ class Comparison {
       const cells = [one, other].map((each) => element("td", { class: "wide" }, each === null ? "–" : recorded(each.slice(0, TEXT_MAX))));
       return element("tr", {}, element("td", {}, of === "object" ? "object " : "", recorded(where)), ...cells, element("td", { class: "quiet" }, what === "value" ? "" : what));
     });
-    const heads = ["fact or object", ...LETTERS, ""].map((each) => element("th", { scope: "col" }, each));
+    const heads = ["fact or object", ...LETTERS, "differs"].map((each) => element("th", { scope: "col" }, each));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows));
     part("differences").replaceChildren(element("h2", {}, "Facts and last places of objects"), rows.length > 0 ? table : element("p", { class: "quiet" }, "They do not differ."));
   }
