@@ -180,18 +180,7 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
 
     Raises `NotEncodable`, also for a payload of more than `bytes_max` bytes.
     """
-    try:
-        payload = _encoder.encode(event)
-    except UnicodeEncodeError:
-        raise _first_fault(event) or NotEncodable("", "holds a lone surrogate") from None
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise _first_fault(event) or NotEncodable("", str(error)) from None
-    # The encoder writes NaN as null and U+0000 as an escape, so only payloads that hold one of these need a search.
-    # A search for one byte takes a third of the time of a search for six, and few payloads hold an escape.
-    if b"null" in payload or (b"\\" in payload and b"\\u0000" in payload):
-        fault = _first_fault(event)
-        if fault is not None:
-            raise fault
+    payload = _json(event)
     if len(payload) > bytes_max:
         raise NotEncodable("", f"the record takes {len(payload):,} bytes, {bytes_max:,} are allowed (record_bytes_max)")
     return payload
@@ -199,19 +188,35 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
 
 def encoded(value: Any) -> msgspec.Raw:
     """Encode one part of several events once, to be put into each of them. Raises `NotEncodable`."""
-    encoded_bytes(value)
-    return msgspec.Raw(_encoder.encode(value))
+    return msgspec.Raw(_json(value))
 
 
 def encoded_bytes(value: Any) -> int:
-    """Return the size in bytes of one part of an event once encoded. Raises `NotEncodable`."""
+    """Return the size in bytes of a value once encoded. Raises `NotEncodable`, also for what the encoder would convert.
+
+    So a key that is not a str and a datetime, which a caller gave for a part of an event, are refused.
+    """
     fault = _first_fault(value)
     if fault is not None:
         raise fault
+    return len(_json(value))
+
+
+def _json(value: Any) -> bytes:
+    """Encode an event or a part of one. Raises `NotEncodable`."""
     try:
-        return len(_encoder.encode(value))
+        payload = _encoder.encode(value)
+    except UnicodeEncodeError:
+        raise _first_fault(value) or NotEncodable("", "holds a lone surrogate") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise NotEncodable("", str(error)) from None
+        raise _first_fault(value) or NotEncodable("", str(error)) from None
+    # The encoder writes NaN as null and U+0000 as an escape, so only JSON that holds one of these needs a search.
+    # A search for one byte takes a third of the time of a search for six, and few payloads hold an escape.
+    if b"null" in payload or (b"\\" in payload and b"\\u0000" in payload):
+        fault = _first_fault(value)
+        if fault is not None:
+            raise fault
+    return payload
 
 
 class _DtypeOnly(msgspec.Struct):

@@ -12,7 +12,6 @@ import re
 import zlib
 from base64 import b64decode
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import msgspec
@@ -80,9 +79,10 @@ class PoseReference(_Value, frozen=True):
         """Return the reference that a parameter is; None if it is none."""
         if not isinstance(value, dict) or "pose_of" not in value or value.keys() != {"pose_of", "field", "slot"}:
             return None
-        with suppress(msgspec.ValidationError):
+        try:
             return msgspec.convert(value, cls)
-        return None
+        except msgspec.ValidationError:
+            return None
 
 
 def with_poses(parameters: Mapping[str, Any], of_node: Callable[[int], Mapping[str, Any] | None]) -> dict[str, Any]:

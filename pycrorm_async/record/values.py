@@ -706,10 +706,16 @@ class FailureCopies:
             if copied() is failure and former_arguments is arguments and former_message == message:
                 return value
         value = failure_value(failure, references, convert)
-        if all(type(each) in _PLAIN for each in arguments):
+        poses: FrozenPoses | None = getattr(references, "frozen_poses", None)
+        if all(_is_fixed(each, poses) for each in arguments):
             with suppress(TypeError):  # of a built-in class, to which there are no weak references
                 self._last = ref(failure), arguments, message, value
         return value
+
+
+def _is_fixed(argument: object, poses: FrozenPoses | None) -> bool:
+    kind = type(argument)
+    return kind in _PLAIN or issubclass(kind, Enum) or (poses is not None and poses.get(argument) is not None)
 
 
 def failure_value(

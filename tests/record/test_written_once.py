@@ -226,6 +226,22 @@ def test_an_exception_is_copied_once_until_it_changes_and_is_not_kept_alive() ->
     assert here() is None
 
 
+class Poses:
+    """Looks up no object, and has the copies of poses that never change."""
+
+    frozen_poses = FrozenPoses(Pose)
+
+    def reference(self, key: Any, /) -> None:
+        """Return no row."""
+
+
+def test_an_exception_with_a_frozen_pose_and_a_member_of_an_enum_is_copied_once() -> None:
+    copies, failure = FailureCopies(), Spilled(Pose([1.0, 0.0, 0.0]), Arms.LEFT)
+    first = copies.copy(failure, Poses())
+    assert first.arguments[1] == "LEFT"
+    assert copies.copy(failure, Poses()) is first
+
+
 def test_an_exception_of_a_built_in_class_is_copied_at_each_node() -> None:
     copies, failure = FailureCopies(), ValueError("too far")
     assert copies.copy(failure, NO_REFERENCES) == copies.copy(failure, NO_REFERENCES)
