@@ -42,7 +42,7 @@ from pycrorm_async.learning.policy_cards import PolicyCard, read_card
 from pycrorm_async.learning.policy_file import name_of, save_policy
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
-from pycrorm_async.learning.scenes import Scene
+from pycrorm_async.learning.scenes import Disturbance, Scene
 from pycrorm_async.learning.success_model import Draws, SuccessModel
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import progress_bar
@@ -86,6 +86,29 @@ def learn(
             help="Limits of the object's height in m, drawn for each rollout, as is its heading; else it is at 0.9 m.",
         ),
     ] = None,
+    tables: Annotated[
+        bool, typer.Option("--tables", help="Put the object on a table, drawn for each rollout: use --collisions too.")
+    ] = False,
+    parked: Annotated[
+        bool, typer.Option("--parked", help="Park the arms first; else all their joints are at 0.")
+    ] = False,
+    base_noise: Annotated[
+        tuple[float, float],
+        typer.Option(
+            metavar="M DEGREES",
+            help="Standard deviations of the robot's errors when it drives: in x and y, m, and in its heading.",
+        ),
+    ] = (0.0, 0.0),
+    object_noise: Annotated[
+        tuple[float, float],
+        typer.Option(
+            metavar="M DEGREES",
+            help="Standard deviations of the object's pose from where it is believed, which a gripper can miss.",
+        ),
+    ] = (0.0, 0.0),
+    slip: Annotated[
+        float, typer.Option(help="Probability, 0 to 1, with which an object slips that is gripped in its middle.")
+    ] = 0.0,
     evaluate: Annotated[int, typer.Option(min=1, help="Rollouts that evaluate the learned policy.")] = 2_000,
     held_out: Annotated[
         int, typer.Option(min=1, help="Random rollouts kept out of learning, to measure the policy's coverage.")
@@ -183,7 +206,16 @@ def learn(
         raise CallerError(f"--explore {explore} needs --model success: other policies try as they act")
     if study_rollouts and model is not Learned.PLACES:
         raise CallerError(f"--study needs --model places, got --model {model}")
-    scene = Scene(limits=limits, collisions=collisions, heights=heights, turned=heights is not None)
+    (base_m, base_deg), (object_m, object_deg) = base_noise, object_noise
+    scene = Scene(
+        limits=limits,
+        collisions=collisions,
+        heights=heights,
+        turned=heights is not None,
+        table=tables,
+        parked=parked,
+        disturbance=Disturbance(base_m, math.radians(base_deg), object_m, math.radians(object_deg), slip),
+    )
     experiment = Experiment(
         model=model,
         explore=explore or Draws.UNCERTAIN,
@@ -337,7 +369,12 @@ def _print(learned: ExperimentResult, in_kitchen: KitchenResult, studied: Study 
             for each in learned.phases
         ],
     )
-    facts = {"from": _size(learned), "coverage": _coverage(learned), "kitchen": _kitchen(in_kitchen)}
+    facts = {
+        "from": _size(learned),
+        "coverage": _coverage(learned),
+        "ceiling": learned.ceiling and f"in {learned.ceiling:.1%} of the held-out scenes some way succeeds",
+        "kitchen": _kitchen(in_kitchen),
+    }
     print_facts("Learned", facts)
     if studied is not None:
         _print_study(studied)
@@ -449,6 +486,7 @@ def _document(
         "figure": str(figure),
         "successes": len(learned.successes),
         "coverage": learned.coverage,
+        "ceiling": learned.ceiling,
         "kitchen": {
             "episode": in_kitchen.episode,
             "tries": in_kitchen.tries,

@@ -9,30 +9,39 @@ resumed: only the rollouts that are not recorded yet are performed.
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import asynccontextmanager, suppress
+from contextvars import Context
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError, InternalError, NotEnoughExperience
 from pycrorm_async.learning import rollouts as recorded_rollouts
 from pycrorm_async.learning.cluster import RolloutPool, check_cluster, rollout_pool
-from pycrorm_async.learning.features import PickUpContext
+from pycrorm_async.learning.features import PickUpContext, features_of_frame
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.polar_policy import PolarPolicy
-from pycrorm_async.learning.policy import PickUpChoice, Policy, default_policy
+from pycrorm_async.learning.policy import Floats, PickUpChoice, Policy, default_policy
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.pool import ROLLOUTS_PER_RUN, SETTINGS, MemoryLocation, RolloutTask
-from pycrorm_async.learning.recorded_policy import Evaluation, read_evaluation, record_evaluation, record_policy
+from pycrorm_async.learning.recorded_policy import (
+    Evaluation,
+    HeldOut,
+    read_evaluation,
+    record_evaluation,
+    record_policy,
+)
 from pycrorm_async.learning.rollouts import Tally, tally_of
-from pycrorm_async.learning.scenes import Scene
+from pycrorm_async.learning.scenes import Disturbance, Scene, Stage
 from pycrorm_async.learning.success_model import CONFIDENT, Draws, SuccessModel
 from pycrorm_async.learning.tree import check_leaf, learn, learn_polar
 from pycrorm_async.memory import Memory
@@ -41,6 +50,7 @@ from pycrorm_async.orm import LearnPolicyAction
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
 if TYPE_CHECKING:
@@ -51,6 +61,12 @@ _DRAWN = 20_000
 """The ways from which the figure of a policy that sets the torso is drawn."""
 HELD_OUT_SEED = 1_000_003
 """Added to the experiment's seed for the held-out default rollouts, so that their seed is not used for learning."""
+
+CEILING_WAYS, CEILING_SCENES = 500, 100
+"""The ways that are tried in each scene to find one that succeeds, and the scenes: seconds, of which a scene without a
+way takes one."""
+_CEILING = 4
+"""Separates the random numbers of these ways from those of scenes, errors and policies."""
 
 ReportProgress = Callable[[str, int, int, Tally], None]
 """Callback for progress: the phase's name, rollouts done, rollouts in total, results so far."""
@@ -158,12 +174,14 @@ class ExperimentResult:
         successes: the choices that succeeded among those from which it was learned.
         coverage: the share of the held-out successes that the policy could have chosen; None if none succeeded. Of a
             success model, that of which it is confident.
+        ceiling: the share of held-out scenes in which some way succeeds, see `ceiling_of`; None if it was not measured.
     """
 
     phases: tuple[Phase, ...]
     policy: AnyPolicy
     successes: tuple[PickUpChoice, ...]
     coverage: float | None
+    ceiling: float | None = None
 
     @property
     def default(self) -> Phase:
@@ -321,9 +339,11 @@ async def run(
         held_out_seed = experiment.seed + HELD_OUT_SEED
         held_out = await runner.phase("default policy, held out", first, held_out_seed, experiment.held_out)
         coverage = coverage_of(held_out, policy)
-        await runner.record_evaluation(policy, Evaluation(coverage=coverage))
+        limit = ceiling_of(experiment.scene, first, held_out_seed, experiment.held_out)
+        ceiling = await asyncio.create_task(limit, context=Context())  # in which no memory of the caller records
+        await runner.record_evaluation(policy, _evaluation(held_out, policy, coverage, ceiling))
         successes = tuple(choices_of(recorded_rollouts.successes(tries)))
-        return ExperimentResult(tuple(runner.phases), policy, successes, coverage)
+        return ExperimentResult(tuple(runner.phases), policy, successes, coverage, ceiling)
 
 
 def _explorer(experiment: Experiment, policy: AnyPolicy, first: AnyPolicy) -> AnyPolicy:
@@ -378,6 +398,57 @@ def coverage_of(held_out: pd.DataFrame, policy: AnyPolicy) -> float | None:
     if not len(done):
         return None
     return policy.coverage(choices_of(done)) if isinstance(policy, Policy) else policy.coverage(done)
+
+
+def rated(policy: AnyPolicy, tries: pd.DataFrame) -> tuple[NDArray[np.bool_], Floats | None]:
+    """Return whether the policy would have chosen each of these pick-ups, and its probability of success.
+
+    A success model chooses those of which it is confident; a tree has no probability.
+    """
+    if isinstance(policy, SuccessModel):
+        probabilities = policy.probability_in(tries)
+        return probabilities >= CONFIDENT, probabilities
+    if isinstance(policy, Policy):
+        return policy.likelihood(choices_of(tries)) > 0, None
+    return policy.density_of(features_of_frame(tries)) > 0, None
+
+
+def _evaluation(held_out: pd.DataFrame, policy: AnyPolicy, coverage: float | None, ceiling: float) -> Evaluation:
+    tried = held_out.dropna(subset=["object_x", "height"])  # without those of which no place is recorded
+    if tried.empty:
+        return Evaluation(coverage=coverage, ceiling=ceiling)
+    succeeded = (tried["status"] == TaskStatus.SUCCEEDED.value).to_numpy()
+    return Evaluation(
+        held_out=(HeldOut.of("seed", 1, succeeded, *rated(policy, tried)),), coverage=coverage, ceiling=ceiling
+    )
+
+
+async def ceiling_of(scene: Scene, policy: AnyPolicy, seed: int, count: int) -> float:
+    """Return the share of these scenes in which one of `CEILING_WAYS` ways of this policy succeeds.
+
+    No choice among its ways succeeds more often, and errors of the robot, of which it makes none here, only make that
+    rarer. The first `CEILING_SCENES` of a scene that varies are tried, and one of any other; nothing is recorded.
+    """
+    solved, number = 0, min(count, CEILING_SCENES) if scene.varies else 1
+    with replace(scene, disturbance=Disturbance()).entered() as stage:
+        for index in range(number):
+            target = stage.prepare(seed, index)
+            action = MoveAndPickUp(target, policy=policy, rng=np.random.default_rng((seed, index, _CEILING)))
+            with suppress(PlanFailure):  # no place is free
+                ways = map(action.way, action.rated(CEILING_WAYS)[0])
+                solved += await _any_succeeds(ways, stage, seed, index)
+            stage.reset()
+    return solved / number
+
+
+async def _any_succeeds(ways: Iterable[MoveAndPickUpPerformable], stage: Stage, seed: int, index: int) -> bool:
+    for way in ways:
+        with suppress(PlanFailure):
+            await way.perform()
+            return True
+        stage.reset()
+        stage.prepare(seed, index)
+    return False
 
 
 def choices_of(frame: pd.DataFrame) -> list[PickUpChoice]:

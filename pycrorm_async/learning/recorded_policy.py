@@ -13,10 +13,14 @@ JSON under the name of the policy; the latest one counts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Select, and_, or_, select
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition
@@ -33,6 +37,7 @@ EPISODES_MAX = 10_000
 _MEDIA_TYPE = "application/json"
 _OBSERVATION = "policy"
 _EVALUATION = "policy_evaluation"
+_BINS: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 class CalibrationBin(msgspec.Struct, frozen=True):
@@ -66,10 +71,35 @@ class HeldOut(msgspec.Struct, frozen=True):
     brier: float | None = None
     calibration: tuple[CalibrationBin, ...] = ()
 
+    @classmethod
+    def of(
+        cls,
+        by: str,
+        groups: int,
+        succeeded: NDArray[np.bool_],
+        confident: NDArray[np.bool_],
+        probabilities: NDArray[np.float64] | None,
+    ) -> HeldOut:
+        """Return the evaluation of these pick-ups; `probabilities` are None for a tree. All have shape (pick-ups,)."""
+        figures = len(succeeded), int(succeeded.sum()), int(confident.sum()), int((confident & succeeded).sum())
+        if probabilities is None:
+            return cls(by, groups, *figures)
+        brier = float(np.square(probabilities - succeeded).mean())
+        return cls(by, groups, *figures, brier, tuple(_calibration(probabilities, succeeded)))
+
     @property
     def coverage(self) -> float | None:
         """The share of the held-out successes that the policy would have chosen; None without any."""
         return self.confident_successes / self.successes if self.successes else None
+
+
+def _calibration(probabilities: NDArray[np.float64], succeeded: NDArray[np.bool_]) -> Iterator[CalibrationBin]:
+    numbers = np.clip(np.searchsorted(_BINS, probabilities, side="right") - 1, 0, len(_BINS) - 2)
+    for number, (low, high) in enumerate(pairwise(_BINS)):
+        part = numbers == number
+        if part.any():
+            mean = float(probabilities[part].mean())
+            yield CalibrationBin(low, high, mean, int(part.sum()), int(succeeded[part].sum()))
 
 
 class Evaluation(msgspec.Struct, frozen=True):
@@ -80,7 +110,8 @@ class Evaluation(msgspec.Struct, frozen=True):
         failures: number of the samples that failed; None for a policy learned from successes alone.
         held_out: by each way to hold out pick-ups that the data allows.
         coverage: the share of the successes of other default rollouts that the policy could have made; None if unknown.
-        ceiling: the greatest possible share of successes, 0 to 1; None if it was not measured.
+        ceiling: the share of held-out scenes in which some way succeeds if the robot makes no errors, 0 to 1: no choice
+            of ways can succeed more often. None if it was not measured.
         unknown: what the memory does not know of the samples, such as the place to which the robot was sent.
     """
 

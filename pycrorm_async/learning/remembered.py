@@ -28,7 +28,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -39,14 +38,13 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, NotEnoughExperience
-from pycrorm_async.learning.experiment import Learned, choices_of
-from pycrorm_async.learning.features import PickUpContext, features_of_frame
-from pycrorm_async.learning.policy import Floats, Policy
+from pycrorm_async.learning.experiment import Learned, choices_of, rated
+from pycrorm_async.learning.features import PickUpContext
 from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
-from pycrorm_async.learning.recorded_policy import CalibrationBin, Evaluation, HeldOut, record_policy
+from pycrorm_async.learning.recorded_policy import Evaluation, HeldOut, record_policy
 from pycrorm_async.learning.rollouts import with_parameters
-from pycrorm_async.learning.success_model import CONFIDENT, WITHOUT_HEIGHT, SuccessModel
+from pycrorm_async.learning.success_model import WITHOUT_HEIGHT, SuccessModel
 from pycrorm_async.learning.tree import learn, learn_polar
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.derived_views import parameters_of
@@ -64,7 +62,6 @@ COLUMNS: Final = "robot object arm grasp policy description scene kind".split()
 """The columns that `select_tries` takes."""
 _OWN_WORLD: Final = "BulletWorld ("
 """The begin of the description of a world of this package."""
-_BINS: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True)
@@ -336,29 +333,10 @@ def _held_out(
     probabilities, confident = np.full(len(tries), np.nan), np.zeros(len(tries), np.bool_)
     for fold in range(folds.max() + 1):
         part = folds == fold
-        policy = fit(tries[~part])
-        if isinstance(policy, SuccessModel):
-            probabilities[part] = policy.probability_in(tries[part])
-            confident[part] = probabilities[part] >= CONFIDENT
-        elif isinstance(policy, Policy):
-            confident[part] = policy.likelihood(choices_of(tries[part])) > 0
-        else:
-            confident[part] = policy.density_of(features_of_frame(tries[part])) > 0
-    succeeded = _succeeded(tries)
-    figures = len(tries), int(succeeded.sum()), int(confident.sum()), int((confident & succeeded).sum())
-    if np.isnan(probabilities).any():
-        return HeldOut(name, groups, *figures)
-    brier = float(np.square(probabilities - succeeded).mean())
-    return HeldOut(name, groups, *figures, brier, tuple(_calibration(probabilities, succeeded)))
-
-
-def _calibration(probabilities: Floats, succeeded: NDArray[np.bool_]) -> Iterator[CalibrationBin]:
-    numbers = np.clip(np.searchsorted(_BINS, probabilities, side="right") - 1, 0, len(_BINS) - 2)
-    for number, (low, high) in enumerate(pairwise(_BINS)):
-        part = numbers == number
-        if part.any():
-            mean = float(probabilities[part].mean())
-            yield CalibrationBin(low, high, mean, int(part.sum()), int(succeeded[part].sum()))
+        confident[part], rates = rated(fit(tries[~part]), tries[part])
+        probabilities[part] = np.nan if rates is None else rates
+    is_known = not np.isnan(probabilities).any()
+    return HeldOut.of(name, groups, _succeeded(tries), confident, probabilities if is_known else None)
 
 
 async def record_remembered(memory: Memory, learned: RememberedPolicy) -> str:

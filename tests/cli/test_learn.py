@@ -151,14 +151,15 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
     tally = Tally(1, Counter(IKError=3))
     before = Phase("default policy", "p", 69, tally, {"grasp": 3}, {"LEFT": tally}, {"TOP": Tally()}, 0, 0.0)
     now = replace(before, name="learned policy", done_now=4, seconds=2.0)
-    learned = ExperimentResult((before, now), default_policy(), (), 0.5)
+    learned = ExperimentResult((before, now), default_policy(), (), 0.5, 0.75)
     learn_command._print(learned, KitchenResult(3, None, "out of reach", "an episode"), None)
     printed = [" ".join(line.replace("│", " ").split()) for line in capsys.readouterr().out.splitlines()]
     assert "default policy 4 25.0% 4.6% to 69.9% from the log grasp 3" in printed
     assert "learned policy 4 25.0% 4.6% to 69.9% 2 grasp 3" in printed
-    assert printed[-3:] == [
+    assert printed[-4:] == [
         "from 0 successes, 1 leaves",
         "coverage 50.0% of the held-out successes are possible under the learned policy",
+        "ceiling in 75.0% of the held-out scenes some way succeeds",
         "kitchen not picked up in 3 attempts: out of reach",
     ]
 
@@ -203,6 +204,7 @@ def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) ->
         (("--explore", "random"), 2, "--explore random needs --model success"),
         (("--model", "polar", "--study", "5"), 2, "--study needs --model places, got --model polar"),
         (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
+        (("--base-noise", "-1", "0"), 2, "base_m of a disturbance must be finite and >= 0, got -1.0"),
         (("--rollouts", "9", "--min-samples-leaf", "10"), 2, "choose a larger --rollouts (rollouts=) or a smaller"),
         # learning/test_experiment shows this one of the function
         pytest.param(("--rollouts", "30"), 2, "successes are too few to learn from", marks=pytest.mark.soak),
