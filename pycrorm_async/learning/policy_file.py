@@ -148,9 +148,9 @@ def decode_policy(encoded: bytes) -> AnyPolicy:
     """Return the policy that `encode_policy` wrote. Raises `msgspec.DecodeError` or another `ValueError`."""
     if (kind := msgspec.json.decode(encoded, type=_Kind)).kind is not None:
         own = features.GRASP_POLAR, features.GRASP_POLAR_VERSION
-        if (kind.features, kind.features_version) != own:
+        if kind.features != own[0] or not 1 <= kind.features_version <= own[1]:
             theirs = f"was learned with the features {kind.features}, version {kind.features_version}"
-            raise _OtherFeatures(f"{theirs}, but this program has {own[0]}, version {own[1]}: learn it again")
+            raise _OtherFeatures(f"{theirs}, but this program has {own[0]}, versions 1 to {own[1]}: learn it again")
         return msgspec.json.decode(encoded, type=PolarPolicy | SuccessModel)
     content = msgspec.json.decode(encoded, type=_Policy)
     if (content.arms, content.grasps) != ([each.name for each in ARMS], [each.name for each in GRASPS]):

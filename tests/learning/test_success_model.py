@@ -39,9 +39,11 @@ from pycrorm_async.learning import (
     save_policy,
 )
 from pycrorm_async.learning.experiment import Experiment, Learned, read_rollouts, run
-from pycrorm_async.learning.features import FEATURES, features_of, features_of_frame, place_of
+from pycrorm_async.learning.features import FEATURES, SHOULDER_M, WRIST_M, features_of, features_of_frame, place_of
+from pycrorm_async.learning.policy_cards import read_card
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
+from pycrorm_async.learning.scenes import Disturbance
 from pycrorm_async.learning.success_model import CONFIDENT, Tree
 from pycrorm_async.plan import Retry, simulated_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
@@ -118,6 +120,15 @@ def test_both_arms_and_all_side_grasps_have_the_features_of_their_mirror_images_
     assert (named["height"], named["object_height"]) == pytest.approx((0.8, 0.9))
     assert (named["edge_distance"], named["base_clearance"]) == pytest.approx((0.2, 0.4))
     assert math.isnan(named["width"])
+    base = Pose((-0.6, 0.2, 0), yaw_quaternion(math.atan2(-0.2, 0.6)))
+    wrist = (base.inverse() @ Pose((-WRIST_M, 0, 0))).position
+    assert (named["wrist_ahead"], named["wrist_aside"]) == pytest.approx(wrist[:2])
+    aside, up = wrist.y - SHOULDER_M[0], 0.8 - SHOULDER_M[1]
+    assert (named["reach"], named["reach_angle"]) == pytest.approx(
+        (math.hypot(wrist.x, aside), math.atan2(aside, wrist.x))
+    )
+    assert named["stretch"] == pytest.approx(math.hypot(wrist.x, aside, up))
+    assert named["elevation"] == pytest.approx(math.atan2(up, named["reach"]))
 
 
 @pytest.mark.parametrize("grasp", list(Grasp))
@@ -164,7 +175,12 @@ def test_probabilities_equal_those_of_scikit_learn_also_where_features_are_missi
     rows = features_of_frame(circumstances)
     varied = [number for number, values in enumerate(rows.T) if len(set(values[~np.isnan(values)])) > 1]
     theirs = ensemble.HistGradientBoostingClassifier(
-        max_iter=len(model.trees), min_samples_leaf=10, early_stopping=False, random_state=0
+        max_iter=len(model.trees),
+        min_samples_leaf=10,
+        early_stopping=False,
+        random_state=0,
+        learning_rate=0.05,
+        l2_regularization=1.0,
     )
     with pytest.importorskip("threadpoolctl").threadpool_limits(
         1
@@ -311,13 +327,13 @@ def test_files_of_other_versions_and_damaged_ones_are_refused(tmp_path: Path) ->
     assert load_policy(written(content)) == NEAR_AND_LOW
     with pytest.raises(PolicyFileRefused, match="has format version 3, but this program reads 1 to 2"):
         load_policy(written(content, version=3))
-    newer = content.replace(b'"features_version":1', b'"features_version":2')
-    with pytest.raises(PolicyFileRefused, match=r"features grasp-polar, version 2, but this program has .* version 1"):
+    newer = content.replace(b'"features_version":1', b'"features_version":3')
+    with pytest.raises(PolicyFileRefused, match=r"grasp-polar, version 3, but this program has .*, versions 1 to 2"):
         load_policy(written(newer))
     for good, bad in (
         (b'"left":[1,1,2]', b'"left":[0,1,2]'),  # never ends
         (b'"right":[2,1,2]', b'"right":[3,1,2]'),
-        (b'"feature":[1,-1,-1]', b'"feature":[14,-1,-1]'),
+        (b'"feature":[1,-1,-1]', b'"feature":[20,-1,-1]'),
         (b'"value":[0.0,3.0,-3.0]', b'"value":[0.0,3.0]'),
         (b'"kind":"success model"', b'"kind":"oracle"'),
     ):
@@ -414,7 +430,7 @@ ROUNDS = Experiment(
     evaluate=40,
     held_out=60,
     min_samples_leaf=10,
-    scene=Scene(heights=(0.6, 1.2), turned=True),
+    scene=Scene(heights=(0.6, 1.2), turned=True, disturbance=Disturbance(base_m=0.01)),
     model=Learned.SUCCESS,
 )
 
@@ -436,6 +452,15 @@ async def test_interrupted_rounds_continue_to_the_model_of_rounds_without_an_int
     assert evaluation.tally.success_rate > 0.6
     assert whole.coverage is not None
     assert 0.4 < whole.coverage <= 1
+    async with Reading.open(f"sqlite:///{tmp_path}/whole.db") as reading:
+        card = await read_card(reading, name_of(whole.policy))
+    assert card.evaluation is not None
+    assert (card.evaluation.coverage, card.evaluation.ceiling) == (whole.coverage, whole.ceiling)
+    [tried] = card.evaluation.held_out
+    assert (tried.by, tried.tries, tried.coverage) == ("seed", 60, whole.coverage)
+    assert sum(each.tries for each in tried.calibration) == 60
+    assert card.trainings[0].scene == str(ROUNDS.scene)
+    assert "base off by 0.01 m" in card.trainings[0].scene
 
     class Interrupted(Exception):
         pass
