@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from sqlalchemy import Select
 
     from pycrorm_async.export.export import ExportComparison, Exported, FileFormat
-    from pycrorm_async.export.lerobot import ImageSize
+    from pycrorm_async.export.lerobot_images import ExportedImages
     from pycrorm_async.export.scenes import Clock as StateClock
     from pycrorm_async.export.selection import Exportable
     from pycrorm_async.plan.language import ActionDescription, Designator
@@ -591,7 +591,7 @@ class Memory:
         arguments: Mapping[str, Any] = MappingProxyType({}),
         clock: StateClock | None = None,
         fps: int | None = None,
-        images: ImageSize | None = None,
+        images: ExportedImages | None = None,
     ) -> Exported:
         """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
         from pycrorm_async.export.export import export  # here, because most memories write no file

@@ -79,7 +79,8 @@ def export(
     ] = None,
     fps: Annotated[int | None, typer.Option(help="Of lerobot: frames per second; of mcap by event: events.")] = None,
     images: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of lerobot: a picture of the scene at each frame.")
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT|none", help="Of lerobot: also drawings of the scene; or no images at all."),
     ] = None,
     no_formulas: Annotated[
         bool, typer.Option("--no-formulas", help="Of csv: an apostrophe before each text that a spreadsheet would run.")
@@ -111,7 +112,7 @@ def export(
         file_format = file_format or "parquet"
         out = Path(f"{'-'.join(what or ['episodes'])[:100].replace('/', '-')}.{file_format}")
     options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps, "no_formulas": no_formulas}
-    options["images"] = None if images is None else output.parse_size("--images", images)
+    options["images"] = images if images in (None, "none") else output.parse_size("--images", images)
     options["arguments"] = _arguments(what[0], arguments or []) if what else {}
 
     async def write(report_progress: ProgressCallback | None) -> Exported:

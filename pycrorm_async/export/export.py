@@ -32,7 +32,8 @@ from sqlalchemy import inspect as inspect_database
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export import selection as selections
 from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written
-from pycrorm_async.export.lerobot import LEROBOT, ImageSize, check_size
+from pycrorm_async.export.lerobot import LEROBOT
+from pycrorm_async.export.lerobot_images import ExportedImages, check_size
 from pycrorm_async.export.neem import NEEM
 from pycrorm_async.export.rerun_recording import RERUN
 from pycrorm_async.export.scenes import MCAP, Clock
@@ -152,7 +153,7 @@ async def export(
     force: bool = False,
     clock: Clock | None = None,
     fps: int | None = None,
-    images: ImageSize | None = None,
+    images: ExportedImages | None = None,
     no_formulas: bool = False,
     report_progress: ProgressCallback | None = None,
 ) -> Exported:
@@ -171,7 +172,8 @@ async def export(
         clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
             frames each second (`time`). Of MCAP: the times of the events (`time`, the default), or `fps` events in
             each second (`event`).
-        images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
+        images: of LeRobot: width and height of a drawing of the scene at each frame, which needs the extra `world`,
+            beside the observed images; or `none` without any.
         no_formulas: of CSV: an apostrophe before each text that a spreadsheet would run as a formula.
         report_progress: gets the number of rows, done and of all; of the formats of episodes that of events, with the
             phase, `reading`, `drawing` or `writing`, also from another thread.
@@ -332,7 +334,7 @@ def _options(name: str, format_: Format, values: Mapping[str, Any]) -> dict[str,
         raise CallerError("fps of mcap is for events at equal intervals: choose the clock `event`, or leave fps out")
     if given.get("clock") not in (None, "event", "time"):
         raise CallerError(f"clock must be 'event' or 'time', got {given['clock']!r}")
-    if "images" in given:
+    if given.get("images", "none") != "none":
         check_size(given["images"])
     if not 1 <= given.get("fps", 1) <= 1000:
         raise CallerError(f"fps must be 1 to 1000, got {given['fps']}")

@@ -1,51 +1,40 @@
-"""Write episodes as a LeRobot data set of version 3.0: states of the robot, tasks and subtasks, and images on request.
+"""Write episodes as a LeRobot data set of version 3.0: states of the robot, images, tasks and subtasks.
 
-`states` makes the frames of an episode, `images` draws the scene of each frame, `statistics` computes the values with
-which LeRobot normalises, and the section "dataset" writes the files.
+The files are `meta/`, `data/` and `videos/`, written with pyarrow and PyAV alone.
+
+Each frame has `observation.state` and `action`, the state of the next frame (the last one repeats its own), the event
+and the time behind it, the subtask, and the images of `lerobot_images`. `meta/plan.parquet` is ours: every node of the
+plans, with its first and last frame. LeRobot ignores it.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
-from collections.abc import Callable, Sequence
-from contextvars import Context
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
+from pycrorm_async.export import lerobot_images
 from pycrorm_async.export.formats import Format, Job, Written
+from pycrorm_async.export.lerobot_images import Pixels, Statistics, statistics_of
 from pycrorm_async.export.scenes import ExportedEpisode, Frames, frames_of, read_episode
-from pycrorm_async.query.again import world_of
 from pycrorm_async.query.frames import needed_pyarrow
-from pycrorm_async.query.observed_images import png_of
-from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import Moment, moments
 from pycrorm_async.query.text import parameters_text
-from pycrorm_async.world.pose import Vector
-from pycrorm_async.world.queries import Camera, photograph
 from pycrorm_async.writer.drain import run_to_completion
-
-# === dataset ==================================================================================================
-#
-# Write the files of a LeRobot data set: `meta/` and `data/`, in version 3.0, with pyarrow alone.
-#
-# Each frame has `observation.state` and `action`, the state of the next frame (the last one repeats its own), the event
-# and the time behind it, and the subtask. `meta/plan.parquet` is ours: every node of the plans, with its first and last
-# frame. LeRobot ignores it.
 
 FPS = 10
 """Frames per second; nominal if there is one frame for each event, because LeRobot requires a value."""
-_CHUNK_FILES = 1000
-"""Bounds the files of one folder (`chunk`), the default of LeRobot."""
 _FILE_MEGABYTES = 100
 """The size in MiB above which the next episode begins a new file, the default of LeRobot."""
 _VECTORS = ("observation.state", "action")
-_PICTURE = "observation.images.scene"
+_IMAGES_AT_ONCE = 128
+"""Bounds the frames of a row group that has images, because they are in memory until it is written."""
 
 
 async def write_lerobot(job: Job, folder: Path) -> Written:
@@ -54,7 +43,33 @@ async def write_lerobot(job: Job, folder: Path) -> Written:
     An episode that cannot be read is left out, unless it is the only one. Raises `CallerError` for episodes that the
     format cannot hold, and `MissingExtra`.
     """
-    dataset = LeRobotFolder(folder, fps=job.options["fps"])
+    size, fps, episodes = job.options["images"], job.options["fps"], job.selection.episodes
+    observed = [] if size == "none" else await lerobot_images.observed_cameras(job.reading, episodes)
+    cameras = lerobot_images.features_of(observed, folder, fps)
+    if size not in (None, "none"):
+        if any(each.feature == lerobot_images.DRAWN for each in observed):
+            raise CallerError("the images of a camera that is named scene are observed: leave out the drawn ones")
+        cameras.append(lerobot_images.Camera(lerobot_images.DRAWN, tuple(size), folder, fps, is_video=False))
+    dataset = LeRobotFolder(folder, cameras, fps=fps)
+    try:
+        unreadable = await _add_episodes(job, dataset, observed)
+        await run_to_completion(asyncio.to_thread(dataset.finish))
+    finally:
+        dataset.close()
+    for camera in observed:
+        camera.note()
+    return Written(dataset.frames, unreadable=unreadable)
+
+
+async def _add_episodes(
+    job: Job, dataset: LeRobotFolder, observed: Sequence[lerobot_images.ObservedCamera]
+) -> dict[int, str]:
+    """Add the episodes; return the reasons why some of them are left out, by number."""
+    log, loop, size = await job.reading.log(), asyncio.get_running_loop(), job.options["images"]
+
+    def read_blob(name: str) -> bytes | None:  # in the thread that writes
+        return asyncio.run_coroutine_threadsafe(log.blobs.read_blob(name), loop).result()
+
     episodes, unreadable, before = job.selection.episodes, dict[int, str](), 0
     for each in episodes:
         try:
@@ -69,25 +84,27 @@ async def write_lerobot(job: Job, folder: Path) -> Written:
         frames = await run_to_completion(
             asyncio.to_thread(frames_of, episode, job.options["clock"], job.options["fps"])
         )
-        pictures = None
-        if job.options["images"] is not None:
-            drawn = await draw_frames(
-                job.reading, episode, frames, job.options["images"], job.reporter("drawing", before)
-            )
-            pictures = np.stack(drawn)
-        await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
-        job.reporter("writing", before)(each.events)
+        sequences = [frame.sequence for frame in frames.at]
+        images = {camera.feature: camera.frames(episode, sequences, read_blob) for camera in observed}
+        if size not in (None, "none"):
+            report_drawn = job.reporter("drawing", before)
+            drawn = await lerobot_images.draw_frames(job.reading, episode, frames, size, report_drawn)
+            images[lerobot_images.DRAWN] = iter(drawn)
+        report = job.reporter("writing", before)
+        with log.translated():
+            await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, images, report))
+        report(each.events)
         before += each.events
-    await run_to_completion(asyncio.to_thread(dataset.finish))
-    return Written(dataset.frames, unreadable=unreadable)
+    return unreadable
 
 
 class LeRobotFolder:
-    """Writes a data set into an empty folder: `add` for each episode, then `finish`."""
+    """Writes a data set into an empty folder: `add` for each episode, then `finish`, and `close` also after a fault."""
 
-    def __init__(self, folder: Path, *, fps: int) -> None:
+    def __init__(self, folder: Path, cameras: Sequence[lerobot_images.Camera], *, fps: int) -> None:
         needed_pyarrow()
         self._folder = folder
+        self._cameras = cameras
         self._fps = fps
         self._first: tuple[int, Frames] | None = None
         self.frames = 0
@@ -99,12 +116,17 @@ class LeRobotFolder:
         self._plan: list[dict[str, Any]] = []
         self._file = 0
         self._file_bytes = 0
-        self._picture_shape: tuple[int, ...] = ()
         self._dtypes: dict[str, str] = {}
         self._writer: Any = None
 
-    def add(self, episode: ExportedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
-        """Write the frames of an episode, with their pictures; either all episodes have pictures or none has.
+    def add(
+        self,
+        episode: ExportedEpisode,
+        frames: Frames,
+        images: Mapping[str, Iterator[Pixels]],
+        report_events: Callable[[int], object],
+    ) -> None:
+        """Write the frames of an episode; `images` has those of each camera by feature, one for each frame.
 
         Raises `CallerError` if its robot has other joints than that of the first.
         """
@@ -114,10 +136,19 @@ class LeRobotFolder:
         columns = self._columns(frames, number, task)
         self._dtypes = {name: str(values.dtype) for name, values in columns.items()}
         statistics = {name: statistics_of(values) for name, values in columns.items()}
-        if pictures is not None:
-            self._picture_shape = pictures.shape[1:]
-            statistics[_PICTURE] = statistics_of_images(pictures)
-        chunk, file = self._write(columns, len(frames.channels), pictures)
+        for camera in self._cameras:
+            camera.begin(count)
+        self._begin_file()
+        at_once = _IMAGES_AT_ONCE if self._cameras else count
+        for begin in range(0, count, at_once):
+            part = {name: values[begin : begin + at_once] for name, values in columns.items()}
+            self._write(part, len(frames.channels), images)
+            report_events(frames.at[min(begin + at_once, count) - 1].sequence)
+        places: dict[str, Any] = {}
+        for camera in self._cameras:
+            statistics[camera.feature], place = camera.end()
+            places |= place
+        chunk, file = divmod(self._file, lerobot_images.FILES_IN_CHUNK)
         self._episodes.append(
             {
                 "episode_index": number,
@@ -127,6 +158,7 @@ class LeRobotFolder:
                 "data/file_index": file,
                 "dataset_from_index": self.frames,
                 "dataset_to_index": self.frames + count,
+                **places,
                 **{
                     f"stats/{name}/{key}": values.tolist()
                     for name, each in statistics.items()
@@ -141,15 +173,16 @@ class LeRobotFolder:
         self.frames += count
 
     def finish(self) -> None:
-        """Write the files in `meta/`, which describe the episodes."""
-        if self._writer is not None:
-            self._writer.close()
+        """Complete the files, and write those in `meta/`, which describe the episodes."""
+        self.close()
         assert self._first is not None, "an episode was added"
         _, frames = self._first
         meta = self._folder / "meta"
         (meta / "episodes" / "chunk-000").mkdir(parents=True)
         _write_json(meta / "info.json", self._info(frames))
-        totals = {name: joined([each[name] for each in self._statistics]) for name in self._statistics[0]}
+        totals = {
+            name: lerobot_images.joined([each[name] for each in self._statistics]) for name in self._statistics[0]
+        }
         _write_json(
             meta / "stats.json",
             {name: {key: values.tolist() for key, values in each.items()} for name, each in totals.items()},
@@ -158,6 +191,14 @@ class LeRobotFolder:
         _write_names(meta / "subtasks.parquet", "subtask", self._subtasks)
         _write_rows(meta / "episodes" / "chunk-000" / "file-000.parquet", self._episodes)
         _write_rows(meta / "plan.parquet", self._plan)
+
+    def close(self) -> None:
+        """Close the files that are open."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
+        for camera in self._cameras:
+            camera.close()
 
     def _check_channels(self, episode: ExportedEpisode, frames: Frames) -> None:
         if self._first is None:
@@ -189,10 +230,14 @@ class LeRobotFolder:
             "subtask_index": np.array(subtasks, dtype=np.int64),
         }
 
-    def _write(
-        self, columns: dict[str, NDArray[Any]], width: int, pictures: NDArray[np.uint8] | None
-    ) -> tuple[int, int]:
-        """Write the frames of an episode as one row group; return the numbers of the chunk and the file."""
+    def _begin_file(self) -> None:
+        """Begin a new file if the present one is large."""
+        if self._writer is not None and self._file_bytes > _FILE_MEGABYTES * 2**20:
+            self._writer.close()
+            self._writer, self._file, self._file_bytes = None, self._file + 1, 0
+
+    def _write(self, columns: Mapping[str, NDArray[Any]], width: int, images: Mapping[str, Iterator[Pixels]]) -> None:
+        """Write frames as one row group, and their images."""
         pa = needed_pyarrow()
         from pyarrow import parquet
 
@@ -202,21 +247,19 @@ class LeRobotFolder:
             else pa.array(values)
             for name, values in columns.items()
         }
-        if pictures is not None:
-            encoded = [{"bytes": png_of(each, 9), "path": None} for each in pictures]
-            arrays[_PICTURE] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+        count = len(columns["index"])
+        for camera in self._cameras:
+            values = [camera.put(each) for each in islice(images[camera.feature], count)]
+            if not camera.is_video:
+                arrays[camera.feature] = pa.array(values, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
         table = pa.table(arrays)
-        if self._writer is not None and self._file_bytes > _FILE_MEGABYTES * 2**20:
-            self._writer.close()
-            self._writer, self._file, self._file_bytes = None, self._file + 1, 0
-        chunk, file = divmod(self._file, _CHUNK_FILES)
         if self._writer is None:
+            chunk, file = divmod(self._file, lerobot_images.FILES_IN_CHUNK)
             path = self._folder / "data" / f"chunk-{chunk:03d}" / f"file-{file:03d}.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = parquet.ParquetWriter(path, table.schema)
         self._writer.write_table(table)
         self._file_bytes += table.nbytes
-        return chunk, file
 
     def _add_plan(self, episode: ExportedEpisode, frames: Frames, number: int) -> None:
         """Note every node with the frames from its start to its end; `to_index` is behind the last one."""
@@ -248,22 +291,20 @@ class LeRobotFolder:
         features: dict[str, Any] = dict.fromkeys(_VECTORS, vector)
         for name, dtype in self._dtypes.items():
             features.setdefault(name, {"dtype": dtype, "shape": [1], "names": None})
-        if self._picture_shape:
-            names = ["height", "width", "channels"]
-            features[_PICTURE] = {"dtype": "image", "shape": list(self._picture_shape), "names": names}
+        features |= {each.feature: each.info() for each in self._cameras}
         return {
             "codebase_version": "v3.0",
             "robot_type": frames.robot,
             "total_episodes": len(self._episodes),
             "total_frames": self.frames,
             "total_tasks": len(self._tasks),
-            "chunks_size": _CHUNK_FILES,
+            "chunks_size": lerobot_images.FILES_IN_CHUNK,
             "data_files_size_in_mb": _FILE_MEGABYTES,
-            "video_files_size_in_mb": 200,
+            "video_files_size_in_mb": lerobot_images.VIDEO_MEGABYTES,
             "fps": self._fps,
             "splits": {"train": f"0:{len(self._episodes)}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-            "video_path": None,
+            "video_path": lerobot_images.VIDEO_PATH if any(each.is_video for each in self._cameras) else None,
             "features": features,
         }
 
@@ -298,133 +339,11 @@ def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
     parquet.write_table(table, path)
 
 
-# === images ===================================================================================================
-#
-# Draw the scene at each frame of an episode, from the recorded geometry, with one fixed camera.
-#
-# The camera looks from the side at all places where the robot is. A picture of 320 x 240 takes about 0.1 s of CPU time.
-
-ImageSize = tuple[int, int]
-"""Width and height in pixels."""
-
-_SIDE_LEAST, _SIDE_MOST = 16, 2000
-"""Bounds the width and the height of an image, in pixels."""
-_REACH_M = 1.2
-"""The camera shows this much around the places of the robot's base: what its arms reach."""
-_HEIGHT_M = 0.8
-"""Height of the point that the camera looks at."""
-_YAW_DEG, _VIEW_DEG = 215.0, 40.0
-_EVENTS_AT_ONCE = 64
-"""Bounds the snapshots that wait to be drawn."""
-
-
-def check_size(size: ImageSize) -> None:
-    """Raise `CallerError` for a size outside the range that a picture can have."""
-    if not all(_SIDE_LEAST <= each <= _SIDE_MOST for each in size):
-        raise CallerError(f"images must be {_SIDE_LEAST} to {_SIDE_MOST} pixels wide and high, got {size!r}")
-
-
-async def draw_frames(
-    reading: Reading,
-    episode: ExportedEpisode,
-    frames: Frames,
-    size: ImageSize,
-    report_events: Callable[[int], object],
-) -> list[NDArray[np.uint8]]:
-    """Return the picture of each frame, of shape (height, width, 3). Frames of one event share theirs.
-
-    `report_events` gets the event up to which the frames are drawn.
-
-    Raises `EngineMissing` without the extra `world`.
-    """
-    camera = _camera(frames, size)
-    sequences = sorted({each.sequence for each in frames.at})
-    drawn: dict[int, NDArray[np.uint8]] = {}
-    waiting: list[Moment] = []
-    async for moment in moments(await reading.log(), episode.number, set(sequences)):
-        waiting.append(moment)
-        if len(waiting) == _EVENTS_AT_ONCE or moment.sequence == sequences[-1]:
-            # In a thread with an empty context the world belongs to no open episode and is not recorded.
-            pictures = await asyncio.to_thread(Context().run, _drawn, waiting, camera, size)
-            drawn.update(zip((each.sequence for each in waiting), pictures, strict=True))
-            report_events(moment.sequence)
-            waiting = []
-    return [drawn[each.sequence] for each in frames.at]
-
-
-def _camera(frames: Frames, size: ImageSize) -> Camera:
-    low, high = frames.states[:, :2].min(axis=0), frames.states[:, :2].max(axis=0)
-    middle = (low + high) / 2
-    radius = float(np.linalg.norm(high - low)) / 2 + _REACH_M
-    narrow = math.atan(math.tan(math.radians(_VIEW_DEG / 2)) * min(1.0, size[0] / size[1]))
-    target = Vector(float(middle[0]), float(middle[1]), _HEIGHT_M)
-    return Camera(target, radius / math.sin(narrow), _YAW_DEG, view_deg=_VIEW_DEG)
-
-
-def _drawn(moments: Sequence[Moment], camera: Camera, size: ImageSize) -> list[NDArray[np.uint8]]:
-    pictures: list[NDArray[np.uint8]] = []
-    done = 0
-    while done < len(moments):
-        objects = [each.identity_id for each in moments[done].world.objects]
-        with world_of(moments[done]) as world:
-            while done < len(moments) and [each.identity_id for each in moments[done].world.objects] == objects:
-                world.restore_state(moments[done].world.state)
-                pictures.append(photograph(world, camera, *size, smooth=False).pixels)
-                done += 1
-    return pictures
-
-
-# === statistics ===============================================================================================
-#
-# Compute the statistics that LeRobot normalises with, of one episode and of many.
-
-Statistics: TypeAlias = dict[str, NDArray[Any]]
-"""The numbers of each statistic by its name: one for each channel of a feature, or a single one for `count`."""
-
-_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-
-
-def statistics_of(values: NDArray[Any]) -> Statistics:
-    """Return the statistics of a feature over the frames of an episode."""
-    columns = np.asarray(values, dtype=np.float64).reshape(len(values), -1)
-    return {
-        "min": columns.min(axis=0),
-        "max": columns.max(axis=0),
-        "mean": columns.mean(axis=0),
-        "std": columns.std(axis=0),
-        "count": np.array([len(columns)]),
-        **{name: np.quantile(columns, share, axis=0) for name, share in _QUANTILES.items()},
-    }
-
-
-def statistics_of_images(pictures: NDArray[np.uint8]) -> Statistics:
-    """Return the statistics of each colour over all pixels, from 0 to 1, in the shape (3, 1, 1) that LeRobot has."""
-    pixels = statistics_of(pictures.reshape(-1, 3) / 255)
-    shaped = {name: each.reshape(3, 1, 1) for name, each in pixels.items() if name != "count"}
-    return {**shaped, "count": np.array([len(pictures)])}
-
-
-def joined(parts: Sequence[Statistics]) -> Statistics:
-    """Return the statistics over several episodes; quantiles are the weighted means of theirs, as LeRobot has them."""
-    counts = np.array([each["count"][0] for each in parts], dtype=np.float64)
-    shares = (counts / counts.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
-    means = np.stack([each["mean"] for each in parts])
-    mean = (means * shares).sum(axis=0)
-    variances = np.stack([each["std"] for each in parts]) ** 2
-    return {
-        "min": np.stack([each["min"] for each in parts]).min(axis=0),
-        "max": np.stack([each["max"] for each in parts]).max(axis=0),
-        "mean": mean,
-        "std": np.sqrt(((variances + (means - mean) ** 2) * shares).sum(axis=0)),
-        "count": np.array([int(counts.sum())]),
-        **{name: (np.stack([each[name] for each in parts]) * shares).sum(axis=0) for name in _QUANTILES},
-    }
-
-
 LEROBOT = Format(
     write_lerobot,
     noun="frame",
     holds="episodes",
     options={"clock": "event", "fps": FPS, "images": None},
+    packages=("pyarrow", "av", "pillow"),
     marker="meta/info.json",
 )

@@ -111,9 +111,7 @@ class ExportedEpisode(EpisodeReplay):
             case event_types.ObjectRemoved():
                 self._change(happening.object.object, removed=True)
             case event_types.Observed():
-                for each in observed_images.contents_in(happening.values):
-                    if each.kind is not None:
-                        self.contents.append((self.at, f"{happening.name}.{each.path}".rstrip("."), each))
+                self.contents += [(self.at, *each) for each in contents_of(happening)]
                 for name, number in observed_images.numbers_in(happening.name, happening.values):
                     self.numbers.setdefault(name, []).append((self.at, number))
         return happening
@@ -182,6 +180,13 @@ class ExportedEpisode(EpisodeReplay):
 
 def _numbers(pose: event_types.PoseValue) -> tuple[float, ...]:
     return (*pose.position, *pose.orientation)
+
+
+def contents_of(observed: event_types.Observed) -> Iterator[tuple[str, Content]]:
+    """Yield the images, depth maps and point clouds of an observation, with their names."""
+    for each in observed_images.contents_in(observed.values):
+        if each.kind is not None:
+            yield f"{observed.name}.{each.path}".rstrip("."), each
 
 
 E = TypeVar("E", bound=ExportedEpisode)

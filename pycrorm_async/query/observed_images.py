@@ -186,6 +186,47 @@ def png_of(pixels: NDArray[np.uint8], level: int = 6) -> bytes:
     )
 
 
+def rgb_of(content: Content, data: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a content of the kind `image`, height x width x 3, without opacity.
+
+    Raises `ValueError` for what is no image, and for one of 16 bits, which holds depths; `ImportError` without Pillow
+    for an encoded one.
+    """
+    if not content.media_type.startswith("image/"):
+        pixels = pixels_of(content, data)
+        return np.ascontiguousarray(
+            np.broadcast_to(pixels, (*pixels.shape[:2], 3)) if pixels.shape[2] == 1 else pixels[..., :3]
+        )
+    from PIL import Image
+
+    try:
+        opened = _opened(data)
+        if opened.mode[0] in "IF":
+            raise ValueError("it has 16 bits a pixel, as depths have")
+        return np.asarray(opened.convert("RGB"))
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"it cannot be decoded: {error}") from None
+
+
+def resized(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return pixels, height x width x 3, scaled to a width and a height. Needs Pillow."""
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(pixels).resize(size))
+
+
+def _opened(data: bytes) -> Any:
+    """Return an encoded image, not yet decoded, as Pillow has it. Raises `ValueError` for too many pixels."""
+    from PIL import Image
+
+    image_type(data)
+    with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
+        opened = Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "GIF", "WEBP"))
+    if opened.width * opened.height > _PIXELS_MAX:
+        raise ValueError(f"it has {opened.width} x {opened.height} pixels, more than {_PIXELS_MAX:,}")
+    return opened
+
+
 def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
     """Return a smaller JPEG of an encoded image or of pixels; one of 16 bits is coloured as a depth map.
 
@@ -195,10 +236,7 @@ def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
 
     try:
         if isinstance(image, bytes):
-            with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
-                opened: Any = Image.open(io.BytesIO(image), formats=("PNG", "JPEG", "GIF", "WEBP"))
-            if opened.width * opened.height > _PIXELS_MAX:
-                raise ValueError(f"it has {opened.width} x {opened.height} pixels, more than {_PIXELS_MAX:,}")
+            opened = _opened(image)
             opened.draft("RGB", (side, side))
             if opened.mode[0] == "I":  # 16 bits are the depths of a camera
                 opened = Image.fromarray(colored(smaller(np.asarray(opened), side)))

@@ -7,6 +7,7 @@ import io
 import json
 import sqlite3
 import sys
+from collections.abc import AsyncIterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,13 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from PIL import Image
 from pyarrow import parquet
 
-from pycrorm_async import Reading
+from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
+    Blob,
     EpisodeEnded,
     EpisodeStarted,
     NodeEnded,
@@ -31,7 +34,10 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
 )
 from pycrorm_async.export.export import export, export_again
+from pycrorm_async.export.lerobot_images import Camera
+from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.report.output_files import new_folder
+from pycrorm_async.world import Pose
 from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, SAYING, Script, append_and_fold, declarations, name_of, pose
 
@@ -279,6 +285,170 @@ async def test_options_of_lerobot_are_refused_for_rows(reading: Reading, tmp_pat
         await export(reading, 1, tmp_path / "a.csv", fps=3)
     with pytest.raises(CallerError, match="images are an option of the format lerobot"):
         await export(reading, 1, tmp_path / "a.csv", images=(320, 240))
+
+
+# --- images that were observed ---------------------------------------------------------------------------------
+
+SIDE = 96, 64
+
+
+def image(level: int, size: tuple[int, int] = SIDE) -> np.ndarray:
+    """Return an image whose left half is grey of this level, and whose right half is blue."""
+    width, height = size
+    pixels = np.full((height, width, 3), level, np.uint8)
+    pixels[:, width // 2 :] = (20, 40, 200)
+    return pixels
+
+
+def jpeg(pixels: np.ndarray) -> Blob:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=95)
+    return Blob(file.getvalue(), "image/jpeg")
+
+
+@pytest.fixture
+async def filmed(tmp_path: Path) -> AsyncIterator[Reading]:
+    """Yield a memory of two episodes in which a robot drives and looks, in the second without its wrist's camera.
+
+    The head's camera observes between the moves 0, 1 and 1, 2 (twice), 3 (no image), 4 (of half the size); `small` is
+    too narrow for a video.
+    """
+    url = f"sqlite:///{tmp_path / 'filmed.db'}"
+    with Memory.sync(url) as memory:
+        for number in (1, 2):
+            with memory.recording.episode(description=f"film {number}") as episode:
+                episode.object_added("robot", "agv", "ROBOT", Pose([0, 0, 0]))
+                seen: dict[int, list[object]] = {
+                    1: [Blob(png_of(image(100)), "image/png")],
+                    2: [jpeg(image(130)), jpeg(image(160))],
+                    3: [Blob(b"no image", "image/png")],
+                    4: [Blob(png_of(image(220, (48, 32))), "image/png")],
+                }
+                for move in range(6):
+                    for each in seen.get(move, ()):
+                        episode.observe("head/camera", {"rgb": each})
+                        episode.observe("small", image(90, (32, 24))[..., 0])
+                        episode.observe("depth", np.linspace(0.5, 2, 400, dtype=np.float32).reshape(20, 20))
+                        if number == 1:
+                            episode.observe("wrist", image(50))
+                    episode.object_moved("robot", Pose([move + 1, 0, 0]))
+        memory.flush()
+    async with Reading.open(url) as reading:
+        yield reading
+
+
+HEAD = [0, 0, 100, 160, 160, 220, 220]  # the frames are those of the robot's addition and six moves
+SMALL = [0, 0, *[90] * 5]
+
+
+def videos_of(folder: Path, feature: str, episode: int) -> list[np.ndarray]:
+    """Return the images that LeRobot's reader takes from a video for the frames of an episode."""
+    import av
+
+    info = json.loads((folder / "meta/info.json").read_text())
+    [row] = parquet.read_table(folder / "meta/episodes", filters=[("episode_index", "=", episode)]).to_pylist()
+    chunk, file, begin_s, end_s = (
+        row[f"videos/{feature}/{name}"] for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+    )
+    path = folder / info["video_path"].format(video_key=feature, chunk_index=chunk, file_index=file)
+    with av.open(str(path)) as container:
+        [stream] = container.streams.video
+        declared = info["features"][feature]["info"]
+        assert (stream.codec.canonical_name, stream.pix_fmt, int(stream.base_rate)) == (
+            declared["video.codec"],
+            declared["video.pix_fmt"],
+            declared["video.fps"],
+        )
+        assert (stream.height, stream.width, 3) == tuple(info["features"][feature]["shape"])
+        frames = {each.time: each.to_ndarray(format="rgb24") for each in container.decode(stream)}
+    timestamps = pd.read_parquet(folder / "data").query(f"episode_index == {episode}").timestamp
+    assert end_s - begin_s == pytest.approx(len(timestamps) / info["fps"])
+    wanted = [begin_s + each for each in timestamps]
+    times = np.array([*frames])
+    nearest = [float(times[np.abs(times - each).argmin()]) for each in wanted]
+    np.testing.assert_allclose(nearest, wanted, rtol=0, atol=1e-4)  # the tolerance of LeRobot's reader
+    return [frames[at] for at in nearest]
+
+
+def levels_of(pictures: list[np.ndarray]) -> list[float]:
+    """Return the mean level of the left half of each image."""
+    return [float(each[:, : each.shape[1] // 2].mean()) for each in pictures]
+
+
+async def test_observed_images_are_videos_of_the_last_one_before_each_frame(
+    filmed: Reading, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("av", reason="videos need PyAV")
+    folder = tmp_path / "film"
+    await export(filmed, ["1", "2"], folder, file_format="lerobot", fps=30)
+    info = json.loads((folder / "meta/info.json").read_text())
+    features = {name: each for name, each in info["features"].items() if name.startswith("observation.images.")}
+    head, wrist, small = (f"observation.images.{each}" for each in ("head_camera.rgb", "wrist", "small"))
+    assert {name: (each["dtype"], each["shape"]) for name, each in features.items()} == {
+        head: ("video", [64, 96, 3]),
+        wrist: ("video", [64, 96, 3]),
+        small: ("image", [24, 32, 3]),
+    }
+    assert {str(each.relative_to(folder)) for each in folder.rglob("*.mp4")} == {
+        f"videos/{each}/chunk-000/file-000.mp4" for each in (head, wrist)
+    }
+    for episode, at_wrist in ((0, [0, 0, *[50] * 5]), (1, [0] * 7)):
+        decoded = videos_of(folder, head, episode)
+        assert levels_of(decoded) == pytest.approx(HEAD, abs=3)
+        assert levels_of(videos_of(folder, wrist, episode)) == pytest.approx(at_wrist, abs=3)
+        difference = np.abs(decoded[3].astype(int) - image(160)).mean()
+        assert difference < 3
+    rows = pd.read_parquet(folder / "data")
+    assert {name for name in rows if name.startswith("observation.images.")} == {small}
+    pictures = [np.asarray(Image.open(io.BytesIO(each["bytes"]))) for each in rows[small]]
+    assert levels_of(pictures) == SMALL * 2
+    statistics = json.loads((folder / "meta/stats.json").read_text())
+    expected = (sum(HEAD) + 5 * 20) / 14 / 255  # of red, in two halves of seven frames, of which two are black
+    assert statistics[head]["mean"][0][0][0] == pytest.approx(expected, abs=0.002)
+    assert statistics[head]["count"] == [14]
+    head_note = (
+        "camera head_camera.rgb: 6 of 10 images are in the 14 frames, each of which has the last one before it"
+        " (--clock time takes frames at a rate); black frames before the first image: 4; images of other sizes, scaled"
+        " to 96 x 64: 2; images that cannot be read: 2 (it is no PNG, JPEG, GIF or WebP image)"
+    )
+    small_note = "small are PNGs in the rows, because videos have sides of 64 to 4096 pixels, and these 32 x 24"
+    assert head_note in caplog.text
+    assert small_note in caplog.text
+    assert (await export_again(filmed, folder.with_name("film.manifest.json"))).same
+
+
+async def test_without_pyav_observed_images_are_png_in_the_rows(
+    filmed: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "av.codec", None)
+    monkeypatch.setitem(sys.modules, "av", None)
+    await export(filmed, 1, tmp_path / "film", file_format="lerobot")
+    assert "are PNGs in the rows, because videos need PyAV: pip install 'pycrorm-async[video]'" in caplog.text
+    assert json.loads((tmp_path / "film/meta/info.json").read_text())["video_path"] is None
+    rows = pd.read_parquet(tmp_path / "film/data")
+    pictures = [Image.open(io.BytesIO(each["bytes"])) for each in rows["observation.images.head_camera.rgb"]]
+    assert {(each.format, each.size) for each in pictures} == {("PNG", SIDE)}
+    assert levels_of([np.asarray(each) for each in pictures]) == pytest.approx(HEAD, abs=3)
+    assert not [*tmp_path.rglob("*.mp4")]
+    await export(filmed, 1, tmp_path / "states", file_format="lerobot", images="none")
+    assert not [each for each in pd.read_parquet(tmp_path / "states/data") if "images" in each]
+
+
+async def test_a_disk_that_is_full_while_a_video_is_written_leaves_no_data_set(
+    filmed: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("av", reason="videos need PyAV")
+    close = Camera.close
+
+    def close_on_a_small_disk(camera: Camera) -> None:  # only here, because SQLite needs space to read
+        with files_of_at_most(700):
+            close(camera)
+
+    monkeypatch.setattr(Camera, "close", close_on_a_small_disk)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(OSError, match="File too large"):
+        await export(filmed, 1, tmp_path / "film", file_format="lerobot")
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_lerobots_own_loader_reads_it(dataset: Path) -> None:
