@@ -86,6 +86,7 @@ class DisturbedModules(SimulatedModules):
     def __init__(self, limits: Limits, disturbance: Disturbance, *, collisions: bool = False) -> None:
         super().__init__(limits, collisions=collisions)
         self._disturbance = disturbance
+        self.errors = str(disturbance)
         self._slipping: set[Arms] = set()
         self.rng = np.random.default_rng(0)
 

@@ -476,6 +476,11 @@ def execute(motion: Performable, module: str) -> Awaitable[Any]:
     return executing
 
 
+def innermost_choice() -> ChosenRobot | None:
+    """Return the innermost choice; None without one."""
+    return next(reversed(_chosen.get()), None)
+
+
 def chosen_limits() -> Limits:
     """Return the arm limits of the innermost choice; soft limits without a choice."""
     chosen = _chosen.get()
@@ -499,10 +504,13 @@ def collisions_count() -> bool:
 class SimulatedModules:
     """The process modules of `with simulated_robot:`; inverse kinematics keeps the arms within `limits`.
 
+    `errors` are those that it makes, in words; this robot makes none.
     With `collisions` a goal is refused at which the arm or the held object, or the base, collides with another object;
     the gripper itself may collide if the motion allows it. Driving moves the whole robot, but arms and held objects are
     checked only by their own motions.
     """
+
+    errors = ""
 
     def __init__(self, limits: Limits, *, collisions: bool = False) -> None:
         self._limits = limits

@@ -17,6 +17,9 @@ numbers. Heights are compared over the torso, because the reach of an arm depend
 `recall.experience`, for every type of action. The interval is Wilson's for the sum of w of all tries, so that a try
 that is less alike counts less; with less than `EVIDENCE_MIN` it is 0 to 1, because nothing is known.
 
+Tries in rollouts whose scene names other joint limits or errors of the robot, or where furniture or collisions count
+differently than at present, do not count (`Conditions`). Of other tries this is not known, so all of them count.
+
 Where a success model has ranked the action (`MoveAndPickUp(policy=model)`), its prediction takes the place of the
 prior, and the interval counts it as one try, so that it decides where little is remembered.
 """
@@ -25,7 +28,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -40,6 +43,7 @@ from pycrorm_async.plan.advice import Chance
 from pycrorm_async.plan.failures import RefusedByPrediction, describe_error
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.locations import face
+from pycrorm_async.plan.motions import innermost_choice
 from pycrorm_async.plan.objects import ObjectDesignator, pose_of
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.query.success import interval_95
@@ -50,7 +54,7 @@ from pycrorm_async.recall.search import Wanted, dtype_of, never_seen
 from pycrorm_async.record.plan_types import built_in_declaration, declared_type
 from pycrorm_async.record.values import Field, pose_value, read_parameters
 from pycrorm_async.world.bullet import BulletWorld, Object, current_world
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.pose import ObjectType, Pose
 from pycrorm_async.world.world_copy import acting_robot
 
 EVIDENCE_MIN: Final = 0.5
@@ -123,14 +127,15 @@ class Situation(NamedTuple):
     model: str | None = None
 
 
-def predict(library: CaseLibrary, situations: Iterable[Situation]) -> list[Prediction]:
-    """Predict the outcome of an action in each of these situations."""
+def predict(library: CaseLibrary, situations: Iterable[Situation], unlike: Collection[int] = ()) -> list[Prediction]:
+    """Predict the outcome of an action in each of these situations; tries in the episodes `unlike` do not count."""
+    left_out = np.array(sorted(unlike), np.int64)
     tries: dict[tuple[str, frozenset[tuple[str, str]]], _Tries] = {}
     predictions = []
     for each in situations:
         key = each.type, frozenset(each.words.items())
         if key not in tries:
-            tries[key] = _Tries.of(library, each.type, each.words)
+            tries[key] = _Tries.of(library, each.type, each.words, left_out)
         predictions.append(tries[key].prediction(each, library))
     return predictions
 
@@ -146,11 +151,11 @@ class _Tries:
         self._prior = (successes + 1) / (count + 2)
 
     @classmethod
-    def of(cls, library: CaseLibrary, type_: str, words: Mapping[str, str]) -> _Tries:
+    def of(cls, library: CaseLibrary, type_: str, words: Mapping[str, str], left_out: NDArray[np.int64]) -> _Tries:
         chosen, successes, count = [], 0, 0
         of_object = {name: words[name] for name in ("object_type", "robot") if name in words}
         for group in library.groups(type_):
-            ended = _ended(group)
+            ended = _ended(group) & ~np.isin(group.episodes, left_out)
             like = ended & _having(group, of_object)
             successes += int((like & group.texts["status"].having("SUCCEEDED")).sum())
             count += int(like.sum())
@@ -222,6 +227,68 @@ def _reason(tries: Group, likeness: NDArray[np.float64]) -> str | None:
     weights[0] = 0.0
     best = int(weights.argmax())
     return str(column.words[best - 1]) if weights[best] >= _LIKE_MIN else None
+
+
+# === conditions ===============================================================================================
+#
+# Leave out tries of rollouts under other conditions than the present ones, which the words of their scene name.
+
+
+class Conditions(NamedTuple):
+    """What rollouts agree in whose outcomes can be compared.
+
+    Attributes:
+        limits: of the arms' joints, in words.
+        collisions: whether they count.
+        furniture: whether there is any.
+        errors: of the robot, in words, empty for none; None if they are not known, as those of a real robot.
+    """
+
+    limits: str
+    collisions: bool
+    furniture: bool
+    errors: str | None
+
+    @classmethod
+    def of_scene(cls, scene: str | None) -> Conditions | None:
+        """Return those that the description of a scene names (`learning.Scene`); None if it names no limits."""
+        parts = (scene or "").split(", ")
+        at = next((number for number, part in enumerate(parts) if part.endswith(" limits")), None)
+        if at is None:
+            return None
+        limits, *others = parts[at:]
+        errors = [each for each in others if each.startswith(("base off", "object off")) or each.endswith(" slip")]
+        furniture = not {"in the kitchen", "on a table"}.isdisjoint(others)
+        return cls(limits, "collisions count" in others, furniture, ", ".join(errors))
+
+    @classmethod
+    def at_present(cls) -> Conditions | None:
+        """Return those of the chosen robot in its world; None without a choice or a world."""
+        choice, world = innermost_choice(), current_world.get()
+        if choice is None or world is None:
+            return None
+        furniture = any(each.object_type is ObjectType.ENVIRONMENT for each in world.objects)
+        limits = f"{choice.limits.name.lower()} limits"
+        return cls(limits, choice.collisions, furniture, getattr(choice.modules, "errors", None))
+
+
+def unlike_episodes(batches: Iterable[tuple[int, str | None]]) -> frozenset[int]:
+    """Return the episodes all of whose batches of rollouts had other conditions than the present ones.
+
+    Args:
+        batches: numbers of episodes with the description of the scene of a batch.
+    """
+    present, scenes = Conditions.at_present(), dict[str | None, bool]()
+    if present is None:
+        return frozenset()
+    alike, unlike = set[int](), set[int]()
+    for episode, scene in batches:
+        if scene not in scenes:
+            recorded = Conditions.of_scene(scene)
+            errors = None if recorded is None else recorded.errors if present.errors is None else present.errors
+            scenes[scene] = recorded in (None, present._replace(errors=errors))
+        (alike if scenes[scene] else unlike).add(episode)
+    return frozenset(unlike - alike)
 
 
 # === present situation ========================================================================================

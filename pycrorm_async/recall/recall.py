@@ -28,7 +28,7 @@ from sqlalchemy import Select, select
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, microseconds_of
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, SLOT_NODE, row_id, row_id_min, row_key
-from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
+from pycrorm_async.orm import BatchRolloutAction, EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import ActionDescription, Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.projections.generations import PROJECTION, read_generation
@@ -42,7 +42,14 @@ from pycrorm_async.recall import search
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, merge
 from pycrorm_async.recall.columns import RESERVED, Case
-from pycrorm_async.recall.prediction import Prediction, Situation, predict, present_situation, situations_of
+from pycrorm_async.recall.prediction import (
+    Prediction,
+    Situation,
+    predict,
+    present_situation,
+    situations_of,
+    unlike_episodes,
+)
 from pycrorm_async.recall.search import dtype_of
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.task_status import TaskStatus
@@ -67,6 +74,7 @@ class Recall:
         self._reader = reader
         self._reading = reading
         self._clock = clock
+        self._batches: tuple[int, Sequence[tuple[int, str | None]]] = (0, ())
 
     @property
     def reader(self) -> CaseReader:
@@ -213,7 +221,15 @@ class Recall:
         for dtype, kind in {each.type: type(action) for each, action in zip(situations, actions, strict=True)}.items():
             aliases = aliases_of(kind) if kind.__dtype__ == dtype else ()
             library = await self._reader.library(dtype, aliases)
-        return predict(library, situations)
+        return predict(library, situations, unlike_episodes(await self._rollouts(library)))
+
+    async def _rollouts(self, library: CaseLibrary) -> Sequence[tuple[int, str | None]]:
+        """Return the numbers of the episodes with rollouts, each with the scene of a batch."""
+        batch, count = BatchRolloutAction, library.size("BatchRolloutAction")
+        if count != self._batches[0]:
+            rows = await self._reading.rows(select(batch.process_metadata_id, batch.scene).distinct())
+            self._batches = count, [(number, scene) for number, scene in rows]
+        return self._batches[1]
 
     def _answer(self, cue: search.Cue, library: CaseLibrary) -> Answer:
         search.check_cue(cue, library)

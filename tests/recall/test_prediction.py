@@ -6,7 +6,8 @@ import asyncio
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from bench import advised
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_id
+from pycrorm_async.learning import Disturbance, MoveAndPickUp, Policy, Scene, batch_rollout
 from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable
+from pycrorm_async.learning.policy import Leaf, Linear
 from pycrorm_async.orm import Observation, ObservationValue, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, ActionDescription, PlanFailure, Retry, collected_tree, simulated_robot
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable, NavigateActionPerformable, PickUpAction
@@ -31,6 +34,7 @@ from pycrorm_async.recall.prediction import MemoryAdviser, Prediction, Situation
 from pycrorm_async.recall.search import Wanted
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import Grasp
+from pycrorm_async.world.urdf import Limits
 from tests.databases import Server, put_memory
 from tests.recall.sliding_grips import GripSlidingActionPerformable, SlipperyFailure, grip
 
@@ -158,6 +162,31 @@ async def test_an_action_is_predicted_by_the_tries_in_its_present_situation(data
         assert by_features.tries == pytest.approx(1, abs=1e-3)
         with pytest.raises(CallerError, match="no case of PickUpAction has a feature 'arms'; did you mean arm"):
             await memory.recall.predict(PickUpAction, has={"arms": Arms.LEFT})
+
+
+@pytest.mark.slow
+async def test_rollouts_under_other_conditions_do_not_count(database_url: str, tmp_path: Path) -> None:
+    hard, colliding = Scene(limits=Limits.HARD), Scene(limits=Limits.HARD, collisions=True)
+    disturbed = replace(hard, disturbance=Disturbance(base_m=0.01, slip=0.1))
+    x, y = (Linear((each - 5e-4, each + 5e-4), (0.0, 1.0)) for each in (-0.7, -0.3))
+    here = Policy((Leaf(1.0, (0.5, 0.5), (0.25,) * 4, x, y, None),))
+    others = (Scene(), colliding, disturbed, Scene(limits=Limits.HARD, table=True))
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        for count, scene in enumerate((hard, *others), 2):
+            with scene.entered() as stage:
+                tries = MoveAndPickUp(stage.target, [Arms.LEFT], [Grasp.FRONT], here)
+                await batch_rollout(tries, count, seed=1, scene=str(scene), reset=stage.reset)
+        async with memory.episode(description="outside of rollouts"):
+            with hard.entered() as stage, suppress(PlanFailure):
+                await MoveAndPickUpPerformable(Pose([0.6, 0.7, 0]), stage.target, Arms.LEFT, Grasp.FRONT).perform()
+
+        async def compared_in(scene: Scene) -> int:
+            with scene.entered() as stage:
+                place = Pose([0.6, 0.7, 0])
+                move = MoveAndPickUpPerformable(place, stage.target, Arms.LEFT, Grasp.FRONT)
+                return round((await memory.predict(move)).tries)
+
+        assert [await compared_in(scene) for scene in (hard, *others)] == [3, 4, 5, 6, 7]
 
 
 def test_a_sync_memory_predicts_too(tmp_path: Path) -> None:
