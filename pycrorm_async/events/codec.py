@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, TypeAlias, get_args
 
@@ -175,12 +176,23 @@ declaration_of = _decoder.declaration_of
 description_of = _decoder.description_of
 
 
-def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
-    """Encode an event as its payload; the same event has the same bytes in every process.
+def encode(event: Any, *, bytes_max: int = 2**20) -> bytes:
+    """Encode an event as its payload, or a part of one; the same event has the same bytes in every process.
 
     Raises `NotEncodable`, also for a payload of more than `bytes_max` bytes.
     """
-    payload = _json(event)
+    try:
+        payload = _encoder.encode(event)
+    except UnicodeEncodeError:
+        raise _first_fault(event) or NotEncodable("", "holds a lone surrogate") from None
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise _first_fault(event) or NotEncodable("", str(error)) from None
+    # The encoder writes NaN as null and U+0000 as an escape, so only payloads that hold one of these need a search.
+    # A search for one byte takes a third of the time of a search for six, and few payloads hold an escape.
+    if b"null" in payload or (b"\\" in payload and b"\\u0000" in payload):
+        fault = _first_fault(event)
+        if fault is not None:
+            raise fault
     if len(payload) > bytes_max:
         raise NotEncodable("", f"the record takes {len(payload):,} bytes, {bytes_max:,} are allowed (record_bytes_max)")
     return payload
@@ -188,7 +200,7 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
 
 def encoded(value: Any) -> msgspec.Raw:
     """Encode one part of several events once, to be put into each of them. Raises `NotEncodable`."""
-    return msgspec.Raw(_json(value))
+    return msgspec.Raw(encode(value, bytes_max=sys.maxsize))
 
 
 def encoded_bytes(value: Any) -> int:
@@ -199,24 +211,7 @@ def encoded_bytes(value: Any) -> int:
     fault = _first_fault(value)
     if fault is not None:
         raise fault
-    return len(_json(value))
-
-
-def _json(value: Any) -> bytes:
-    """Encode an event or a part of one. Raises `NotEncodable`."""
-    try:
-        payload = _encoder.encode(value)
-    except UnicodeEncodeError:
-        raise _first_fault(value) or NotEncodable("", "holds a lone surrogate") from None
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise _first_fault(value) or NotEncodable("", str(error)) from None
-    # The encoder writes NaN as null and U+0000 as an escape, so only JSON that holds one of these needs a search.
-    # A search for one byte takes a third of the time of a search for six, and few payloads hold an escape.
-    if b"null" in payload or (b"\\" in payload and b"\\u0000" in payload):
-        fault = _first_fault(value)
-        if fault is not None:
-            raise fault
-    return payload
+    return len(encode(value, bytes_max=sys.maxsize))
 
 
 class _DtypeOnly(msgspec.Struct):
