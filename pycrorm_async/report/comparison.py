@@ -7,20 +7,20 @@ PosixPath('diff.html')
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from pycrorm_async.query.episode_diff import AlignedNode, AlignedRuns, align_runs
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import duration
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.output_files import refuse_existing, write_file
-from pycrorm_async.report.overview import folder_of_pages, write_pages
+from pycrorm_async.report.overview import PAGES_MAX, folder_of_pages, write_pages
 from pycrorm_async.report.write import asset, html_page, page_name, program
 
 _PAIR = "dom episode bodies extent path_lines scene_camera seen_view scene_view map_view playback comparison".split()
@@ -40,7 +40,7 @@ async def write_comparison(
     The page aligns the nodes as `diff` does: by the types from the root down. Of two episodes it has the scenes too,
     and marks a node that took at least half as long again, which `diff` does not compare. Of a long episode it shows
     what `report` shows of it. Of more episodes, such as ten runs of one plan, it shows at each node how many ended in
-    which way, and leads to the page of each, in the folder `NAME.pages` beside `NAME.html`.
+    which way, and leads to the pages of the last 200, in the folder `NAME.pages` beside `NAME.html`.
 
     Raises `UnknownEpisode`; `CallerError` if the file or the folder exists, without `force`; and of two episodes
     `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
@@ -75,15 +75,29 @@ async def _pair(reading: Reading, first: AskedEpisode, second: AskedEpisode, ali
 async def _write_runs(reading: Reading, aligned: AlignedRuns, file: Path, *, force: bool) -> None:
     folder = file.with_name(f"{file.stem}.pages")
     with folder_of_pages(folder, force=force):
-        unreadable = await write_pages(reading, aligned.runs, folder, f"../{quote(file.name)}", force=force)
-        document = _runs_document(aligned, folder, unreadable)
+        shown = aligned.runs[-PAGES_MAX:]
+        unreadable = await write_pages(reading, shown, folder, f"../{quote(file.name)}", force=force)
+        pages = {each.number: page_name(each.number) for each in shown if each.number not in unreadable}
+        runs = [
+            {
+                "number": each.number,
+                "status": each.status,
+                "took": duration(each.duration_ns) or "not ended",
+                "started": f"{each.started_at:%Y-%m-%d %H:%M:%S}",
+                "description": each.description[:_DESCRIPTION_MAX],
+                "page": f"{quote(folder.name)}/{pages[each.number]}" if each.number in pages else "",
+                "unreadable": unreadable.get(each.number, ""),
+            }
+            for each in aligned.runs
+        ]
+        document = {"runs": runs, **_tree_document(aligned)}
         heading = f"{len(aligned.runs)} runs: where they part"
         page = html_page(document, heading, "", asset("web/runs_body.html"), (program(*_RUNS),))
         await asyncio.to_thread(lambda: write_file(page.encode(), file, force=force))
 
 
-def _runs_document(aligned: AlignedRuns, folder: Path, unreadable: Mapping[int, str]) -> dict[str, Any]:
-    """Return the document of `web/runs.js`; of many nodes and runs, those at which the runs part come before others."""
+def _tree_document(aligned: AlignedRuns) -> dict[str, Any]:
+    """Return the tree of all runs; of too many nodes those at which they part, and those around them."""
     shown = aligned.nodes
     if len(shown) * len(aligned.runs) > _CELLS_MAX:
         parted = [each.path for each in shown if len(each.outcomes) > 1]
@@ -107,7 +121,6 @@ def _runs_document(aligned: AlignedRuns, folder: Path, unreadable: Mapping[int, 
     first = aligned.first_parting
     nodes = [[len(each.path) - 1, each.name, int(each is first), ways_of(each)] for each in shown]
     return {
-        "runs": [_run(each, folder, unreadable.get(each.number, "")) for each in aligned.runs],
         "outcomes": [*outcomes],
         "nodes": nodes,
         "left": len(aligned.nodes) - len(shown),
@@ -117,15 +130,3 @@ def _runs_document(aligned: AlignedRuns, folder: Path, unreadable: Mapping[int, 
 def _start(node: NodeSummary | None) -> int:
     """Return the event with which a node began; 0 without one."""
     return node.sequence if node is not None else 0
-
-
-def _run(episode: EpisodeSummary, folder: Path, unreadable: str) -> dict[str, Any]:
-    return {
-        "number": episode.number,
-        "status": episode.status,
-        "took": duration(episode.duration_ns) or "not ended",
-        "started": f"{episode.started_at:%Y-%m-%d %H:%M:%S}",
-        "description": episode.description[:_DESCRIPTION_MAX],
-        "page": "" if unreadable else f"{quote(folder.name)}/{page_name(episode.number)}",
-        "unreadable": unreadable,
-    }

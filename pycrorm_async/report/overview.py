@@ -32,8 +32,8 @@ from pycrorm_async.report.write import SimilarCases, asset, html_page, page_name
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import ObjectType
 
-_PAGES_MAX = 200
-"""Bounds the pages behind an overview: one has about 0.7 MB."""
+PAGES_MAX = 200
+"""Bounds the pages behind an overview, or a comparison of runs: one has about 0.7 MB."""
 
 
 class Overview(NamedTuple):
@@ -77,7 +77,7 @@ async def overview(
     title = f"Episodes: {choice}" if str(choice) else "Episodes"
     successes = await success_documents(reading, [each.number for each in episodes], plots)
     with folder_of_pages(folder, force=force):
-        shown = episodes[-_PAGES_MAX:]
+        shown = episodes[-PAGES_MAX:]
         back = f"../{quote(file.name)}" if is_page else file.name
         unreadable = await write_pages(reading, shown, folder, back, force=force, images=images)
         shown = [each for each in shown if each.number not in unreadable]

@@ -110,6 +110,14 @@ def test_chosen_curves_lie_over_one_another_on_the_axis_of_the_chart(chrome: Bro
         assert tab.ask(f"{WINDOW}[1] - {WINDOW}[0]") == pytest.approx(high - low)
         tab.ask("document.querySelector('.legend button').click()")
         assert_on_axis(tab, 2)
+        tab.wait_for("location.hash.split('c=').length === 3")
+        address, legend_now = tab.ask("location.hash"), tab.ask(legend)
+        assert tab.problems() == []
+    with chrome.open(pages["plan"], fragment=f"{address}&c=none&c=%E0%A4%A") as tab:  # two that name no curve
+        assert [each.split()[:2] for each in tab.ask(legend)] == [each.split()[:2] for each in legend_now]
+        assert_on_axis(tab, 2)
+        tab.ask("location.hash = '#e20'")
+        tab.wait_for("!document.getElementById('curves').hasChildNodes()")
         assert tab.problems() == []
 
 

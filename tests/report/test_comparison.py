@@ -150,8 +150,11 @@ def test_both_scenes_are_played_on_one_clock(chrome: Browser, url: str, tmp_path
             for event, side in zip(events, (first, second), strict=True):
                 assert event == sum(each <= seconds * 1e6 + 1 for each in side)
         assert tab.ask(f"{button}.getAttribute('aria-label')") == "play"
-        tab.ask(f"{button}.focus()")
-        tab.press(" ")  # the browser presses a focused button itself: once, and not twice
+        tab.ask("document.querySelector('#nodes h2 button').focus()")
+        tab.press(" ")  # presses the focused button, and does not play
+        pressed = "document.querySelector('#nodes h2 button').getAttribute('aria-pressed')"
+        assert tab.ask(f"[{pressed}, pycrormComparison.playback.running]") == ["true", False]
+        tab.ask(f"{button}.click()")
         assert tab.ask("[pycrormComparison.playback.running, pycrormComparison.seconds < 1]") == [True, True]
         tab.ask("document.querySelector('#nodes .link').click()")
         assert not tab.ask("pycrormComparison.playback.running")

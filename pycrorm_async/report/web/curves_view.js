@@ -36,6 +36,13 @@ export class CurvesView {
     return curves.filter(({ track: { values } }) => values.some((each) => each !== values[0]));
   }
 
+  /** Draw the curves with these keys below the chart, and no others. */
+  choose(keys) {
+    const moving = this.#moving;
+    this.chosen.clear();
+    for (const curve of keys.map((key) => moving.find((each) => each.key === key))) if (curve !== undefined && !this.chosen.has(curve.key)) this.#choose(curve);
+  }
+
   /** Draw a curve below the chart, or no longer. */
   #choose(curve) {
     const free = STROKES.findIndex((_, index) => ![...this.chosen.values()].some(({ number }) => number === index));
@@ -95,6 +102,7 @@ export class CurvesView {
   /** Show the values at a moment. */
   show(event) {
     this.event = event;
+    if (this.gantt.places === undefined) return; // the chart is not drawn yet
     this.draw();
     const x = this.gantt.xOf(event);
     for (const each of this.overlay.querySelectorAll("line")) for (const end of ["x1", "x2"]) each.setAttribute(end, x);

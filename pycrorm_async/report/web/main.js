@@ -22,7 +22,7 @@ const HELP = [
   "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows all of the moment and its paths, R follows the robot.",
   "Chart: the wheel zooms, with Shift or sideways it moves, a double click shows all; the map below the axis is dragged. While the chart or a curve has the focus, W and S zoom, A and D move, 0 shows all.",
   "Curves: they follow the chart. A name draws its curve below the chart, over the others that are chosen, one scale for each unit; a click on its legend takes it away.",
-  "Tree: / finds nodes by words, or by type:PickUp object:milk robot:pr2 status:failed reason:IK text:grasp; Enter goes to the next one. The address of the page keeps the moment, the node and what was searched.",
+  "Tree: / finds nodes by words, or by type:PickUp object:milk robot:pr2 status:failed reason:IK text:grasp; Enter goes to the next one. The address of the page keeps the moment, the node, the chosen curves and what was searched.",
   "Words: an episode is one recorded run of a plan. A node is one performed step of it, such as an action or a motion. An event is one fact that was stored when it happened, e12 the twelfth of the episode. A snapshot is the state of nodes, objects and robots at one moment.",
 ];
 const part = (name) => document.getElementById(name);
@@ -43,7 +43,7 @@ class Page {
     this.view = this.#sceneOrMap();
     this.tree = new TreeView(part("tree"), episode, { onSelect: select });
     this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select, onDraw: () => this.#followAxis() });
-    this.curves = new CurvesView(part("curves"), episode, this.gantt, () => this.panels.redrawCurves());
+    this.curves = new CurvesView(part("curves"), episode, this.gantt, () => this.#showCurves());
     const holders = { strip: part("strip"), inset: part("seen"), dialog: part("picture") };
     this.seen = new SeenView(holders, episode, { xOf: (event) => this.gantt.xOf(event), onSeek: seek });
     const choose = (object) => this.choose(object);
@@ -69,6 +69,7 @@ class Page {
     const [event, node] = [number("e"), episode.nodeAt.get(number("n"))];
     const query = decoded(parts.find((each) => each.startsWith("q="))?.slice(2) ?? "");
     if (query !== this.query) this.search(query);
+    this.curves.choose(parts.filter((each) => each.startsWith("c=")).map((each) => decoded(each.slice(2))));
     if (Number.isNaN(event) && node === undefined) return false;
     if (node !== undefined && node !== this.selected) this.select(node);
     if (!Number.isNaN(event) && event !== this.event) this.#moveTo(event, this.selected === node ? node : null);
@@ -81,6 +82,7 @@ class Page {
     if (selected !== null) names.push(`n${selected.start}`);
     if (selected === null ? !this.following : selected.lastEvent !== event) names.push(`e${event}`);
     if (query) names.push(`q=${encodeURIComponent(query)}`);
+    for (const key of this.curves.chosen.keys()) names.push(`c=${encodeURIComponent(key)}`);
     return names.length > 0 ? `#${names.join("&")}` : location.pathname + location.search;
   }
 
@@ -220,6 +222,12 @@ class Page {
     this.panels.choose(object);
     if (object !== null) this.panels.open("objects");
     this.show();
+  }
+
+  /** Draw the panel of the curves for those that are chosen, and keep them in the address. */
+  #showCurves() {
+    this.panels.redrawCurves();
+    this.#keepAddress();
   }
 
   /** Draw what stands on the axis of the chart where its events have other places. */
