@@ -509,6 +509,11 @@ WORKERS: Final = 2
 """The fold workers of one daemon: one writes while the other prepares. More would compete for the database's writes."""
 
 
+_REST_S_MAX: Final = 0.5
+"""Bounds the rest of a daemon that shares a memory with others after a batch of a few events. It rests as long as the
+batch took: what arrives meanwhile is folded as one batch, which costs the processors little more than a small one."""
+
+
 class DaemonNote(msgspec.Struct, frozen=True):
     """The note in the spool's lock file, which `pycrorm status` reads."""
 
@@ -614,6 +619,7 @@ class FoldWorkerTables(TablesPort):
         self._target = LiveTarget(destination.log)
         self._runner = FoldRunner(self._target)
         self._has_news = True
+        self._rest_until_s = 0.0
 
     @property
     def has_other_writers(self) -> bool:
@@ -636,8 +642,13 @@ class FoldWorkerTables(TablesPort):
         return folded
 
     async def _fold_with(self, workers: Sequence[FoldWorker], share: Share) -> bool:
+        now_s = asyncio.get_running_loop().time
+        await asyncio.sleep(self._rest_until_s - now_s())
+        began_s = now_s()
         try:
             count = await self._runner.fold_next(workers)
+            if share.many > 1 and 0 < (count or 0) < LOOKAHEAD_EVENTS_MIN:
+                self._rest_until_s = now_s() + min(now_s() - began_s, _REST_S_MAX)
             self._has_news = count is not None or await workers[0].fold_rest(share, now=self._has_news)
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True

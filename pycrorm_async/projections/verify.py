@@ -40,8 +40,8 @@ _KEPT = text("""
 SELECT episode, sequence, digest FROM pycrorm_digest
 WHERE episode BETWEEN :first AND :last ORDER BY episode, sequence""")
 _WITHOUT_EPISODE = text("""
-SELECT DISTINCT episode FROM pycrorm_digest
-WHERE episode BETWEEN :first AND :last AND episode NOT IN (SELECT number FROM episode) ORDER BY episode""")
+SELECT DISTINCT episode FROM pycrorm_digest WHERE episode BETWEEN :first AND :last
+AND NOT EXISTS (SELECT 1 FROM episode WHERE number = pycrorm_digest.episode) ORDER BY episode""")
 _EVENTS_BEYOND = text("""
 SELECT episode, head, max(sequence) FROM pycrorm_digest JOIN episode ON number = episode
 WHERE episode BETWEEN :first AND :last AND sequence > head GROUP BY episode, head ORDER BY episode""")

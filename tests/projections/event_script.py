@@ -75,7 +75,7 @@ class Script:
     """Collect the events of one episode. `put` returns the event's sequence, as a queue would."""
 
     def __init__(self, episode: int = 1) -> None:
-        self.episode = EpisodeId(bytes([0, 0, 0, 0, 0, 0, 0x70, 0, 0x80, 0, 0, 0, 0, 0, episode // 256, episode % 256]))
+        self.episode = EpisodeId(bytes([0, 0, 0, 0, 0, 0, 0x70, 0, 0x80, 0, 0, 0, 0, *episode.to_bytes(3)]))
         self.records: list[Record] = []
 
     def put(self, event: Happening, *, version: int | None = None) -> int:

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from pathlib import Path
 
+import asyncpg
 import pytest
 
 from pycrorm_async import Memory, Settings
@@ -21,6 +22,7 @@ from pycrorm_async.projections.custom_tables import is_stalled
 from pycrorm_async.projections.pipeline import WHOLE, Share
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.dialect import FOLDING
 from tests.commands import NOTES_PLAN, Started, answer, pycrorm
 from tests.databases import Server, ask
 from tests.store.factories import started
@@ -107,6 +109,21 @@ async def test_the_share_of_a_process_that_does_not_look_is_folded_by_another_un
         folder.group._looked_s -= 100.0
         assert (await folder.group.share()).many == many
     assert (await idle.group.share()).many == (await folder.group.share()).many == 2
+
+
+async def test_a_daemon_of_an_earlier_version_which_shows_no_look_keeps_its_share(
+    database_url: str, folders: list[LogAndTables]
+) -> None:
+    folder = folders[0]
+    earlier = await asyncpg.connect(database_url)
+    try:
+        await earlier.execute(f"SELECT pg_advisory_lock_shared({FOLDING})")
+        for _ in range(5):
+            assert (await folder.group.share()).many == 2
+            folder.group._looked_s -= 100.0
+    finally:
+        await earlier.close()
+    assert await folder.group.share() == WHOLE
 
 
 async def test_a_fold_of_all_is_whole_beside_the_task_that_folds_a_share(folders: list[LogAndTables]) -> None:
