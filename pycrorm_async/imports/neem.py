@@ -87,7 +87,7 @@ def read_neem(path: Path, settings: NeemMap, intake: Intake) -> None:
         for findings, count in facts.findings().items():
             intake.left_out("checks", findings, count)
         for index, episode in enumerate(facts.episodes()):
-            _Episode(files, facts, episode, settings, intake, has_tf=index == 0).give(cuts)
+            _NeemEpisode(files, facts, episode, settings, intake, has_tf=index == 0).give(cuts)
     for each in cuts:
         intake.cut(path, str(each))
 
@@ -332,7 +332,7 @@ def _frame_in(value: Any) -> str | None:
 # === episodes =================================================================================================
 
 
-class _Episode:
+class _NeemEpisode:
     """Gives one episode to the intake."""
 
     def __init__(

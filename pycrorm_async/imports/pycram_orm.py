@@ -81,7 +81,7 @@ def read_pycram_orm(path: Path, settings: OrmMap, intake: Intake) -> None:
                 missing = ", ".join(sorted(_NEEDED - tables))
                 raise intakes.WrongFormat(f"{path} is no database of PyCRAM's ORM: it has no table {missing}")
             for row in database.execute('SELECT * FROM "ProcessMetaData" ORDER BY id').fetchall():
-                _Episode(database, tables, dict(row), zone, intake).give(path)
+                _PycramEpisode(database, tables, dict(row), zone, intake).give(path)
     except KeyError as error:
         raise intakes.WrongFormat(f"{path} is no database of PyCRAM's ORM: it has no column {error}") from None
     except intakes.DATABASE_ERRORS as error:
@@ -91,7 +91,7 @@ def read_pycram_orm(path: Path, settings: OrmMap, intake: Intake) -> None:
 FORMAT = intakes.ImportFormat(read_pycram_orm, "databases of PyCRAM's ORM (SQLite), as in the thesis", OrmMap)
 
 
-class _Episode:
+class _PycramEpisode:
     """Gives the nodes of one row of `ProcessMetaData` to the intake."""
 
     def __init__(

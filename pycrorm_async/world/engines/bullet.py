@@ -43,7 +43,7 @@ _LINKS_APART_MAX = 5
 """Bullet compares a link with a whole body of 22 links in the time of six calls for single links."""
 
 
-class _Body:
+class _BulletBody:
     """A loaded body: Bullet's numbers of its links and joints by name, and its state."""
 
     def __init__(self, model: Model, number: int, client: int) -> None:
@@ -96,7 +96,7 @@ class Bullet:
     def __init__(self, mode: poses.WorldMode) -> None:
         self.client = _connect(mode)
         self._bullet = library()
-        self._bodies: dict[int, _Body] = {}
+        self._bodies: dict[int, _BulletBody] = {}
 
     @classmethod
     def title(cls) -> str:
@@ -112,7 +112,7 @@ class Bullet:
     def load(self, name: str, model: Model) -> tuple[int, tuple[str, ...]]:
         """Load a model; the remarks are what Bullet printed, and the visual meshes that it does not draw."""
         number, remarks = _load(name, model, self.client)
-        self._bodies[number] = body = _Body(model, number, self.client)
+        self._bodies[number] = body = _BulletBody(model, number, self.client)
         if any(shape.kind == "mesh" for link in model.links.values() for shape in link.collisions):
             _ = body.boxes  # while the files are those that Bullet has read
         return number, remarks

@@ -68,7 +68,7 @@ class MuJoCo:
         library()
         if mode is poses.WorldMode.GUI:
             raise poses.WorldUnavailable("MuJoCo opens no window here: use WorldMode.DIRECT, or engine='bullet'")
-        self._bodies: dict[int, _Body] = {}
+        self._bodies: dict[int, _MujocoBody] = {}
         self._last = FLOOR
         self._collisions = _Scene()
         self._visuals: _Scene | None = None
@@ -94,7 +94,7 @@ class MuJoCo:
             except ValueError as fault:
                 raise poses.DescriptionNotLoadable(name, f"collision of link {link!r}: {fault}") from fault
         self._last += 1
-        body = self._bodies[self._last] = _Body(name, model)
+        body = self._bodies[self._last] = _MujocoBody(name, model)
         self._collisions.add(self._last, body, shapes)
         self._visuals = None
         files = ((link, shape.file) for link, each in model.links.items() for shape in each.visuals if shape.file)
@@ -203,7 +203,7 @@ class MuJoCo:
         """Show nothing: there is no window."""
 
 
-class _Body:
+class _MujocoBody:
     """The state of a body."""
 
     def __init__(self, name: str, model: Model) -> None:
@@ -277,7 +277,7 @@ class _Scene:
         for turn in ((1, 0, 0, 0), (0, 1, 0, 0))[:floor_sides]:  # a plane is met from one side only
             self._spec.worldbody.add_geom(type=plane, size=[0, 0, 1], quat=turn)
 
-    def add(self, number: int, body: _Body, shapes: Mapping[str, Sequence[_Geom]]) -> None:
+    def add(self, number: int, body: _MujocoBody, shapes: Mapping[str, Sequence[_Geom]]) -> None:
         """Add a body with these shapes by link."""
         self._is_compiled = False
         root = self._spec.worldbody.add_body(mocap=True, explicitinertial=True, mass=1.0, inertia=(1, 1, 1))
@@ -339,7 +339,7 @@ class _Scene:
                 self._spec.delete(mesh)
         self.moved.discard(number)
 
-    def current(self, states: Mapping[int, _Body]) -> _Scene:
+    def current(self, states: Mapping[int, _MujocoBody]) -> _Scene:
         """Bring the compiled model and its data up to date; return the scene itself."""
         if not self._is_compiled:
             self._compile()
@@ -501,7 +501,7 @@ def _geom(shape: Shape, color: Color) -> _Geom:
     return _Geom(shape.kind, size, at, color)
 
 
-def _visual_geoms(body: _Body) -> dict[str, tuple[_Geom, ...]]:
+def _visual_geoms(body: _MujocoBody) -> dict[str, tuple[_Geom, ...]]:
     """Return what is drawn of a body; a mesh that cannot be drawn is logged and left out."""
     drawn: dict[str, list[_Geom]] = {}
     for link, each in body.model.links.items():
