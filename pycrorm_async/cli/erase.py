@@ -12,17 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    Form,
-    LakeOption,
-    TagOption,
-    counted,
-    moment,
-    note,
-    parse_since,
-    print_rows,
-    problem,
-)
+from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.clock import utc_of
 from pycrorm_async.errors import CallerError
@@ -44,13 +34,13 @@ def erase(
         str | None,
         typer.Option(metavar="AGE", help="Instead of EPISODE: all that ended before then: 90d, 52w, or a date."),
     ] = None,
-    tag: TagOption = None,
+    tag: output.TagOption = None,
     reason: Annotated[str | None, typer.Option(metavar="TEXT", help="The reason, which stays in the journal.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be erased, and change nothing.")] = False,
-    lake: LakeOption = None,
+    lake: output.LakeOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     place: Place,
-    form: Form,
+    form: output.Form,
 ) -> int:
     """Erase episodes from the log, the tables, recall, blobs, kept segments of the spool and the file's free pages.
 
@@ -77,21 +67,21 @@ async def _erase(
     keep: str | None,
     tags: list[str],
     reason: str,
-    form: Form,
+    form: output.Form,
     lake: str | None,
     *,
     dry_run: bool,
     yes: bool,
 ) -> int:
     async with await EventLog.open(place.shared_address, create=False) as log:
-        before = None if keep is None else parse_since(keep)
+        before = None if keep is None else output.parse_since(keep)
         rows = await removal.erasable(log, names, ended_before=before, tags=tags)
     if dry_run or not rows:
         _print(form, f"To erase from {place.address}", rows)
         return 0
     if not yes:
         listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
-        ask(f"Erase {counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
+        ask(f"Erase {output.counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
     async with await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id) as log:
         spool = place.spool or place.address.default_spool
         done = await removal.erase(log, rows, reason=reason, spool=spool, lake=lake)
@@ -103,7 +93,7 @@ def name_what_is_left(done: Sequence[removal.ErasedEpisode]) -> int:
     """Print a line for each part of an erased episode that is left; return the exit code."""
     for each in done:
         for what in each.left:
-            problem(f"episode {each.removed.number} is erased from the log, and parts of it are left in {what}")
+            output.problem(f"episode {each.removed.number} is erased from the log, and parts of it are left in {what}")
     return 1 if any(each.left for each in done) else 0
 
 
@@ -115,16 +105,16 @@ def ask(question: str) -> None:
     raise CallerError("nothing was erased; --yes answers the question")
 
 
-async def _print_journal(place: Place, form: Form) -> int:
+async def _print_journal(place: Place, form: output.Form) -> int:
     async with await EventLog.open(place.shared_address, create=False) as log:
         removed = await log.all_removed()
     _print(form, f"Removed from {place.address}", removed)
     if form.is_table and not removed:
-        note("nothing was erased or archived; name the episodes to erase, or give --keep")
+        output.note("nothing was erased or archived; name the episodes to erase, or give --keep")
     return 0
 
 
-def _print(form: Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) -> None:
+def _print(form: output.Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) -> None:
     columns = ("episode", "id", "events", "ended", "removed", "reason", "archived in")
     cells: list[tuple[object, ...]] = []
     for each in rows:
@@ -132,9 +122,9 @@ def _print(form: Form, title: str, rows: Sequence[EpisodeRow | RemovedEpisode]) 
         if isinstance(each, RemovedEpisode):
             removal = moment_of(each.removed_wall_ns), each.reason, each.archived_in
         cells.append((each.number, each.id, each.head, moment_of(each.ended_wall_ns), *removal))
-    print_rows(form, [each._asdict() for each in rows], title, columns, cells)
+    output.print_rows(form, [each._asdict() for each in rows], title, columns, cells)
 
 
 def moment_of(wall_ns: int | None) -> str:
     """Return this time as a cell of a table."""
-    return "" if wall_ns is None else moment(utc_of(wall_ns // 1000))
+    return "" if wall_ns is None else output.moment(utc_of(wall_ns // 1000))

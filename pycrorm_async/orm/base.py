@@ -23,29 +23,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, dataclass_trans
 
 import msgspec
 import sqlalchemy as sa
+from sqlalchemy import orm
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.ext.hybrid import hybrid_property
-from sqlalchemy.orm import (
-    DeclarativeBase,
-    InstanceState,
-    InstrumentedAttribute,
-    MappedAsDataclass,
-    MappedColumn,
-    Mapper,
-    ORMExecuteState,
-    RelationshipProperty,
-    Session,
-    Synonym,
-    foreign,
-    load_only,
-    mapped_column,
-    object_session,
-    relationship,
-    remote,
-    selectinload,
-    synonym,
-)
 from sqlalchemy.orm.exc import DetachedInstanceError, ObjectDeletedError
 from sqlalchemy.types import TypeDecorator
 from sqlalchemy.util.concurrency import in_greenlet
@@ -175,9 +156,11 @@ def one_of(reference: Callable[[], Any], table: str, class_: Any = None, **optio
     def joined() -> Any:
         attribute = reference()
         others, own_episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
-        return sa.and_(foreign(attribute) == remote(others.id), own_episode == remote(others.process_metadata_id))
+        return sa.and_(
+            orm.foreign(attribute) == orm.remote(others.id), own_episode == orm.remote(others.process_metadata_id)
+        )
 
-    return _by_id(relationship(class_, primaryjoin=joined, viewonly=True, **options))
+    return _by_id(orm.relationship(class_, primaryjoin=joined, viewonly=True, **options))
 
 
 def many_of(reference: Callable[[], Any], table: str, **options: Any) -> Any:
@@ -186,9 +169,9 @@ def many_of(reference: Callable[[], Any], table: str, **options: Any) -> Any:
     def joined() -> Any:
         attribute = reference()
         own, episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
-        return sa.and_(own.id == remote(foreign(attribute)), own.process_metadata_id == remote(episode))
+        return sa.and_(own.id == orm.remote(orm.foreign(attribute)), own.process_metadata_id == orm.remote(episode))
 
-    return _by_id(relationship(primaryjoin=joined, viewonly=True, **options))
+    return _by_id(orm.relationship(primaryjoin=joined, viewonly=True, **options))
 
 
 def inherited_from(base: Any, table: Any) -> dict[str, Any]:
@@ -229,7 +212,7 @@ class EnumOfObject(EnumName):
         return super().result_processor(dialect, coltype)
 
 
-def _read_members(state: InstanceState[Base], *_: Any) -> None:
+def _read_members(state: orm.InstanceState[Base], *_: Any) -> None:
     values = state.dict
     for key, kind in state.manager.info[_ENUMS].items():
         if type(values.get(key)) is str:
@@ -238,17 +221,17 @@ def _read_members(state: InstanceState[Base], *_: Any) -> None:
 
 @dataclass_transform(
     field_specifiers=(
-        MappedColumn,
-        RelationshipProperty,
-        Synonym,
-        mapped_column,
-        relationship,
-        synonym,
+        orm.MappedColumn,
+        orm.RelationshipProperty,
+        orm.Synonym,
+        orm.mapped_column,
+        orm.relationship,
+        orm.synonym,
         one_of,
         many_of,
     )
 )
-class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
+class Base(orm.MappedAsDataclass, AsyncAttrs, orm.DeclarativeBase, init=False, repr=False, eq=False):
     """The root of the mapped classes. The text of an object has the columns of its class and the robot's state."""
 
     _unmapped: ClassVar[dict[str, dict[str, str]]] = {}
@@ -289,7 +272,7 @@ def map_leaves() -> None:
     Base.registry.configure()
 
 
-def view_mappers() -> dict[str, Mapper[Any]]:
+def view_mappers() -> dict[str, orm.Mapper[Any]]:
     """Return the mappers of this process by view; of the classes that share a view, that of their base."""
     map_leaves()
     own = [
@@ -320,7 +303,7 @@ class RowOfEvent:
 
 
 @sa.event.listens_for(Base, "mapper_configured", propagate=True)
-def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:
+def _complete_mapping(mapper: orm.Mapper[Any], class_: type[Base]) -> None:
     """Let columns of subclasses be loaded in batches, guard attributes on request, and note the enum columns."""
     if mapper.inherits is not None:
         mapper.class_manager.expired_attribute_loader = load_columns
@@ -342,7 +325,7 @@ def require_loaded(row: Base, name: str, requested_by: Base | None = None, reque
     """
     if name in vars(row):
         return
-    session = object_session(row)
+    session = orm.object_session(row)
     if session is not None and (in_greenlet() or not session.get_bind().dialect.is_async):
         return
     named, attribute = requested_by or row, request or name.removeprefix("_")
@@ -359,7 +342,7 @@ ON_REQUEST: Final = {"on_request": True}
 """Marks a relationship that is loaded on request only, as deferred columns are."""
 
 
-class AttributeOnRequest(InstrumentedAttribute[Any]):
+class AttributeOnRequest(orm.InstrumentedAttribute[Any]):
     """An attribute of a mapped class that raises `CallerError` if it is read without being loaded."""
 
     inherit_cache = True
@@ -413,7 +396,7 @@ KEYS = "primary_keys"
 """The parameter in which SQLAlchemy's loads and those of this module pass the ids."""
 
 
-def load_related(state: ORMExecuteState) -> None:
+def load_related(state: orm.ORMExecuteState) -> None:
     """Load a relationship for further objects too, when SQLAlchemy loads it for one: a hook of a session.
 
     SQLAlchemy's own load follows, and takes the related rows from those that are loaded by then.
@@ -421,16 +404,16 @@ def load_related(state: ORMExecuteState) -> None:
     if not state.is_relationship_load:
         return
     loaded, path = state.lazy_loaded_from, state.loader_strategy_path
-    if loaded is None or not path or not isinstance(path[-1], RelationshipProperty):
+    if loaded is None or not path or not isinstance(path[-1], orm.RelationshipProperty):
         return
     related = path[-1]
     class_ = related.parent.class_
     peers = _peers(state.session, loaded, class_, related.key)
     if len(peers) > 1:
-        _load(state.session, class_, peers, load_only(_key(class_)), selectinload(getattr(class_, related.key)))
+        _load(state.session, class_, peers, orm.load_only(_key(class_)), orm.selectinload(getattr(class_, related.key)))
 
 
-def load_columns(state: InstanceState[Any], toload: set[str], passive: Any) -> None:  # noqa: ARG001  SQLAlchemy's
+def load_columns(state: orm.InstanceState[Any], toload: set[str], passive: Any) -> None:  # noqa: ARG001  SQLAlchemy's
     """Load columns of an object's class that the query for its base did not, and those of further such objects."""
     session = state.session
     if session is None:
@@ -440,13 +423,18 @@ def load_columns(state: InstanceState[Any], toload: set[str], passive: Any) -> N
         by_class.setdefault(state.mapper.column_attrs[key].parent.class_, []).append(key)
     for class_, keys in by_class.items():
         _load(
-            session, class_, _peers(session, state, class_, *keys), load_only(*(getattr(class_, key) for key in keys))
+            session,
+            class_,
+            _peers(session, state, class_, *keys),
+            orm.load_only(*(getattr(class_, key) for key in keys)),
         )
         if not state.dict.keys() >= set(keys):
             raise ObjectDeletedError(state)
 
 
-def _peers(session: Session, state: InstanceState[Any], class_: type, *names: str) -> list[InstanceState[Any]]:
+def _peers(
+    session: orm.Session, state: orm.InstanceState[Any], class_: type, *names: str
+) -> list[orm.InstanceState[Any]]:
     """Return this object and those behind it in the session that lack one of these attributes, at most `BATCH`."""
     states = session.identity_map.all_states()
     position = states.index(state)
@@ -459,7 +447,7 @@ def _peers(session: Session, state: InstanceState[Any], class_: type, *names: st
     return peers
 
 
-def _load(session: Session, class_: Any, states: list[InstanceState[Any]], *options: Any) -> None:
+def _load(session: orm.Session, class_: Any, states: list[orm.InstanceState[Any]], *options: Any) -> None:
     rows = [each.obj() for each in states]  # so that no row is collected, and made again, during the load
     keys = sorted({each.identity[0] for each in states if each.identity})
     statement = sa.select(class_).where(_key(class_).in_(sa.bindparam(KEYS, expanding=True))).options(*options)
@@ -469,7 +457,7 @@ def _load(session: Session, class_: Any, states: list[InstanceState[Any]], *opti
 
 def _key(class_: Any) -> Any:
     """Return the first attribute of the class's key: the id of its row, or of the row that it belongs to."""
-    mapper: Mapper[Any] = class_.__mapper__
+    mapper: orm.Mapper[Any] = class_.__mapper__
     return getattr(class_, mapper.get_property_by_column(mapper.primary_key[0]).key)
 
 

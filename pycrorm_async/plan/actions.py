@@ -31,22 +31,11 @@ from typing import ClassVar, Protocol, TypeAlias, TypeVar
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import failures, geometry, objects
+from pycrorm_async.plan import motions as robot_motions
 from pycrorm_async.plan.failures import arms
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.language import ActionAbstract, ActionDescription
 from pycrorm_async.plan.locations import CostmapLocation, Location, LocationDesignator
-from pycrorm_async.plan.motions import (
-    ClosingMotion,
-    DetectingMotion,
-    LookingMotion,
-    MoveArmJointsMotion,
-    MoveGripperMotion,
-    MoveJointsMotion,
-    MoveMotion,
-    MoveTCPMotion,
-    OpeningMotion,
-    collisions_count,
-)
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, yaw_quaternion
 from pycrorm_async.world.urdf import Drive
@@ -73,7 +62,7 @@ class MoveTorsoActionPerformable(CheckedAction):
         return frozenset({failures.Resource.TORSO})
 
     async def perform(self) -> None:
-        await MoveJointsMotion([objects.require_robot().torso_joint()], [self.position]).perform()
+        await robot_motions.MoveJointsMotion([objects.require_robot().torso_joint()], [self.position]).perform()
 
 
 @dataclass
@@ -89,7 +78,7 @@ class SetGripperActionPerformable(CheckedAction):
         return arms(self.gripper)
 
     async def perform(self) -> None:
-        await MoveGripperMotion(self.motion, self.gripper).perform()
+        await robot_motions.MoveGripperMotion(self.motion, self.gripper).perform()
 
 
 @dataclass
@@ -108,9 +97,9 @@ class ParkArmsActionPerformable(CheckedAction):
         parked = {arm: robot.parked(arm) for arm in robot.each_arm(self.arm)}
         if self.arm not in (Arms.LEFT, Arms.RIGHT, Arms.BOTH):
             joints = parked[self.arm]
-            await MoveJointsMotion([*joints], [*joints.values()]).perform()
+            await robot_motions.MoveJointsMotion([*joints], [*joints.values()]).perform()
             return
-        await MoveArmJointsMotion(parked.get(Arms.LEFT), parked.get(Arms.RIGHT)).perform()
+        await robot_motions.MoveArmJointsMotion(parked.get(Arms.LEFT), parked.get(Arms.RIGHT)).perform()
 
 
 @dataclass
@@ -125,7 +114,7 @@ class NavigateActionPerformable(CheckedAction):
         return frozenset({failures.Resource.BASE})
 
     async def perform(self) -> None:
-        await MoveMotion(self.target_location).perform()
+        await robot_motions.MoveMotion(self.target_location).perform()
 
 
 @dataclass
@@ -140,7 +129,7 @@ class LookAtActionPerformable(CheckedAction):
         return frozenset({failures.Resource.HEAD})
 
     async def perform(self) -> None:
-        await LookingMotion(self.target).perform()
+        await robot_motions.LookingMotion(self.target).perform()
 
 
 @dataclass
@@ -172,15 +161,21 @@ class PickUpActionPerformable(CheckedAction):
         robot = objects.require_robot()
         target = objects.in_world(self.object_designator)
         geometry.check_takable(robot, self.arm, target)
-        if collisions_count():
+        if robot_motions.collisions_count():
             geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, self.grasp))
         before, at, above = geometry.pick_up_poses(target.pose, self.grasp, robot.tool_pose(self.arm))
-        await MoveTCPMotion(before, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
-        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
-        await MoveTCPMotion(at, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
-        await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
+        await robot_motions.MoveTCPMotion(
+            before, self.arm, allow_gripper_collision=True, _object_name=target.name
+        ).perform()
+        await robot_motions.MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        await robot_motions.MoveTCPMotion(
+            at, self.arm, allow_gripper_collision=True, _object_name=target.name
+        ).perform()
+        await robot_motions.MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
         geometry.take(robot, self.arm, target)
-        await MoveTCPMotion(above, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
+        await robot_motions.MoveTCPMotion(
+            above, self.arm, allow_gripper_collision=True, _object_name=target.name
+        ).perform()
 
 
 @dataclass
@@ -209,10 +204,10 @@ class PlaceActionPerformable(CheckedAction):
         if body.attachments.get(held) != tool_frame:
             raise failures.ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
         goal = geometry.place_pose(self.target_location, held.pose, robot.tool_pose(self.arm))
-        await MoveTCPMotion(goal, self.arm, _object_name=held.name).perform()
-        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        await robot_motions.MoveTCPMotion(goal, self.arm, _object_name=held.name).perform()
+        await robot_motions.MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         body.detach(held)
-        await MoveTCPMotion(geometry.retract(goal), self.arm, _object_name=held.name).perform()
+        await robot_motions.MoveTCPMotion(geometry.retract(goal), self.arm, _object_name=held.name).perform()
 
 
 @dataclass
@@ -301,9 +296,9 @@ class GripActionPerformable(CheckedAction):
                 f"the {self.gripper.name} gripper would close on nothing: {target.name} is {distance:.3f} m from it"
             )
             raise failures.GripperClosedCompletely(message, target.name, distance)
-        if collisions_count():
+        if robot_motions.collisions_count():
             geometry.check_fits(robot, self.gripper, target, tool.orientation)
-        await MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
+        await robot_motions.MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
         geometry.take(robot, self.gripper, target)
 
 
@@ -331,7 +326,7 @@ class ReleaseActionPerformable(CheckedAction):
         held = objects.in_world(self.object_designator)
         if robot.body.attachments.get(held) != tool_frame:
             raise failures.ObjectLost(f"the {self.gripper.name} gripper does not hold {held.name}", held.name)
-        await MoveGripperMotion(GripperState.OPEN, self.gripper).perform()
+        await robot_motions.MoveGripperMotion(GripperState.OPEN, self.gripper).perform()
         robot.body.detach(held)
 
 
@@ -361,10 +356,10 @@ class GraspingActionPerformable(CheckedAction):
         robot = objects.require_robot()
         goal, name = geometry.grasp_pose(self.object_desig), self.object_desig.name
         geometry.check_free(robot, self.arm)
-        await MoveTCPMotion(geometry.approach(goal), self.arm, _object_name=name).perform()
-        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
-        await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True, _object_name=name).perform()
-        await MoveGripperMotion(GripperState.CLOSE, self.arm, allow_gripper_collision=True).perform()
+        await robot_motions.MoveTCPMotion(geometry.approach(goal), self.arm, _object_name=name).perform()
+        await robot_motions.MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        await robot_motions.MoveTCPMotion(goal, self.arm, allow_gripper_collision=True, _object_name=name).perform()
+        await robot_motions.MoveGripperMotion(GripperState.CLOSE, self.arm, allow_gripper_collision=True).perform()
 
 
 @dataclass
@@ -390,8 +385,8 @@ class OpenActionPerformable(CheckedAction):
     async def perform(self) -> None:
         geometry.handle_of(self.object_designator)
         await GraspingActionPerformable(self.arm, self.object_designator).perform()
-        await OpeningMotion(self.object_designator, self.arm).perform()
-        await MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
+        await robot_motions.OpeningMotion(self.object_designator, self.arm).perform()
+        await robot_motions.MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
 
 
 @dataclass
@@ -409,8 +404,8 @@ class CloseActionPerformable(CheckedAction):
     async def perform(self) -> None:
         geometry.handle_of(self.object_designator)
         await GraspingActionPerformable(self.arm, self.object_designator).perform()
-        await ClosingMotion(self.object_designator, self.arm).perform()
-        await MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
+        await robot_motions.ClosingMotion(self.object_designator, self.arm).perform()
+        await robot_motions.MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
 
 
 # === transport ================================================================================================
@@ -432,7 +427,7 @@ class DetectActionPerformable(CheckedAction):
         return frozenset({failures.Resource.HEAD})
 
     async def perform(self) -> objects.ObjectDesignator:
-        return await DetectingMotion(self.object_designator.object_type).perform()
+        return await robot_motions.DetectingMotion(self.object_designator.object_type).perform()
 
 
 class TransportWays(Protocol):
@@ -491,7 +486,7 @@ class TransportActionPerformable(CheckedAction):
         geometry.check_takable(robot, self.arm, target)
         is_held = robot.body.attachments.get(target) == tool_frame
         fetch = self._way.fetch if self._way is not None else None
-        if collisions_count() and not is_held and fetch is None:
+        if robot_motions.collisions_count() and not is_held and fetch is None:
             geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, Grasp.FRONT))
         await self._park_arms()
         if not is_held:

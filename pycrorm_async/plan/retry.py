@@ -25,14 +25,9 @@ from types import TracebackType
 from typing import Any
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.plan import failures as plan_failures
 from pycrorm_async.plan.advice import advised, adviser
 from pycrorm_async.plan.execution import Simulation, current_simulation, recorder
-from pycrorm_async.plan.failures import (
-    IllPosedGoalFailure,
-    NotALanguageExpression,
-    RefusedByPrediction,
-    describe_error,
-)
 from pycrorm_async.plan.language import Composable, Designator, Expression, attempt, combine_failures, perform_operand
 from pycrorm_async.plan.task import CollectedTree, collecting, current_node
 from pycrorm_async.world.bullet import current_world
@@ -60,7 +55,7 @@ class Retry(Expression):
         except TypeError:
             self.max_tries = 0
         if isinstance(max_tries, bool) or self.max_tries < 1:
-            raise NotALanguageExpression(f"Retry needs an integer max_tries >= 1, got {max_tries!r}")
+            raise plan_failures.NotALanguageExpression(f"Retry needs an integer max_tries >= 1, got {max_tries!r}")
         self.hold([operand])
 
     async def perform(self) -> Any:
@@ -74,15 +69,15 @@ class Retry(Expression):
                     if failure is None:
                         return result
                     failures = [failure]
-                    notes.append(f"try {len(notes) + 1}: {describe_error(failure)}")
+                    notes.append(f"try {len(notes) + 1}: {plan_failures.describe_error(failure)}")
                     del failure
                     if len(notes) == self.max_tries:
                         break
-        except RefusedByPrediction as refused:  # of all alternatives that are left
+        except plan_failures.RefusedByPrediction as refused:  # of all alternatives that are left
             failures = [refused]
             notes.append("")
         if not failures:
-            raise IllPosedGoalFailure(f"{self!r}: the description has no alternative")
+            raise plan_failures.IllPosedGoalFailure(f"{self!r}: the description has no alternative")
         for note in notes[:-1]:
             failures[0].add_note(note)
         raise combine_failures(failures, "")

@@ -34,15 +34,6 @@ from pycrorm_async.projections.generations import (
     write_generation,
 )
 from pycrorm_async.projections.mapped_tables import with_user_views
-from pycrorm_async.projections.pipeline import (
-    LOOKAHEAD_EVENTS_MIN,
-    WHOLE,
-    Batch,
-    FoldRunner,
-    Learn,
-    Share,
-    SideTarget,
-)
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
@@ -57,11 +48,11 @@ _SCAN_S_MAX = 10.0
 """Bounds the time until all episodes are checked again, also after a check that a busy machine made slow."""
 
 
-def learner_of(projection: Projection) -> Learn:
+def learner_of(projection: Projection) -> checkpoints.Learn:
     """Return the function that learns to fold into the tables of a projection."""
     folds = EpisodeFolds(projection)
 
-    def learn(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
+    def learn(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], checkpoints.Batch]]:
         declared = {}
         for payload in payloads:
             try:
@@ -165,15 +156,15 @@ class _CustomFold(NamedTuple):
     """The fold of one projection in this process."""
 
     projection: Projection
-    target: SideTarget
-    runner: FoldRunner
+    target: checkpoints.SideTarget
+    runner: checkpoints.FoldRunner
     others: OtherShares
 
-    async def share(self, own: Share, *, may_compare: bool) -> Share:
+    async def share(self, own: checkpoints.Share, *, may_compare: bool) -> checkpoints.Share:
         """Return the share to fold: the own one, or all of them while one of the others is not folded."""
-        if own == WHOLE or not (may_compare and self.others.is_due):
+        if own == checkpoints.WHOLE or not (may_compare and self.others.is_due):
             return self.others.folded_with(own)
-        self.target.share = WHOLE
+        self.target.share = checkpoints.WHOLE
         async with self.target.log.reading() as connection:
             return self.others.compare(await self.target.behind(connection, 0, _COMPARED_MAX), own)
 
@@ -207,22 +198,24 @@ class CustomTables:
                 _log.warning("%s", fault)
                 continue
             changed = changed or is_new
-            target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
+            target = checkpoints.SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
             batch_events = events_of_batch(each, self._batch_events)
-            runner = FoldRunner(target, learner_of(each), batch_events=batch_events)
+            runner = checkpoints.FoldRunner(target, learner_of(each), batch_events=batch_events)
             self._folds.append(_CustomFold(each, target, runner, OtherShares()))
         return changed
 
-    def companions(self, events: int, *, until_visible: bool) -> list[FoldRunner]:
+    def companions(self, events: int, *, until_visible: bool) -> list[checkpoints.FoldRunner]:
         """Return the folds that take part in a batch of the tables with this number of events.
 
         The package's own projections take part in large batches, and where a caller waits for all; see
         `fold_next_batch`.
         """
-        packed = until_visible or events >= LOOKAHEAD_EVENTS_MIN
+        packed = until_visible or events >= checkpoints.LOOKAHEAD_EVENTS_MIN
         return [each.runner for each in self._folds if packed or not each.projection.is_packed]
 
-    async def fold_next_batch(self, *, now: bool, until_visible: bool = False, share: Share = WHOLE) -> bool:
+    async def fold_next_batch(
+        self, *, now: bool, until_visible: bool = False, share: checkpoints.Share = checkpoints.WHOLE
+    ) -> bool:
         """Fold a batch of this share of each projection; return False if none was behind.
 
         Shares that no process folds are folded too, because the process of another share may not have the code.
@@ -249,7 +242,7 @@ class CustomTables:
                 events = await runner.fold_next()
                 count += events is not None
                 most_events = max(most_events, events or 0)
-                if projection.is_packed and (events is None or events < LOOKAHEAD_EVENTS_MIN):
+                if projection.is_packed and (events is None or events < checkpoints.LOOKAHEAD_EVENTS_MIN):
                     self._packed_s = time_s
             except DatabaseUnavailable:
                 raise
@@ -257,7 +250,7 @@ class CustomTables:
                 _log.warning("this process stops folding the projection %s: %s", projection.name, fault)
                 await self._note_fault(fold, str(fault))
                 self._folds.remove(fold)
-        if is_scan and most_events < min(LOOKAHEAD_EVENTS_MIN, self._batch_events):
+        if is_scan and most_events < min(checkpoints.LOOKAHEAD_EVENTS_MIN, self._batch_events):
             pause_s = 0 if count else (loop.time() - time_s) / _SCAN_SHARE_MAX
             self._scan_due_s = time_s + min(max(pause_s, _CHECK_S), _SCAN_S_MAX)
         if not count:
@@ -339,7 +332,7 @@ class OtherShares:
         """Whether the episodes that are behind should be compared now."""
         return time.monotonic() >= self._compared_s + _STALL_S
 
-    def compare(self, behind: Sequence[EpisodeRow], own: Share) -> Share:
+    def compare(self, behind: Sequence[EpisodeRow], own: checkpoints.Share) -> checkpoints.Share:
         """Compare with the episodes that were behind at the last call; return as `folded_with` does."""
         now = {each.number: each.folded for each in behind}
         self._compared_s = time.monotonic()
@@ -348,9 +341,9 @@ class OtherShares:
         self._behind = now
         return self.folded_with(own)
 
-    def folded_with(self, own: Share) -> Share:
+    def folded_with(self, own: checkpoints.Share) -> checkpoints.Share:
         """Return the share to fold: the own one, or all of them while one of the others is not folded."""
-        return WHOLE if time.monotonic() < self._help_until_s else own
+        return checkpoints.WHOLE if time.monotonic() < self._help_until_s else own
 
 
 def is_stalled(before: Mapping[int, int], now: Mapping[int, int], many: int) -> bool:

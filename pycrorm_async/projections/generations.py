@@ -31,24 +31,8 @@ from itertools import chain
 from typing import Any, Literal, Protocol, TypeAlias
 
 import msgspec
-from sqlalchemy import (
-    Dialect,
-    Index,
-    Integer,
-    LargeBinary,
-    Select,
-    Text,
-    and_,
-    bindparam,
-    case,
-    column,
-    delete,
-    literal,
-    not_,
-    select,
-    table,
-    text,
-)
+import sqlalchemy as sa
+from sqlalchemy import table
 from sqlalchemy.exc import ArgumentError, CompileError, IdentifierError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement
@@ -102,7 +86,7 @@ CREATE TABLE IF NOT EXISTS {_NOTES} (
  revision INTEGER NOT NULL,
  layout TEXT NOT NULL,
  views TEXT NOT NULL)"""
-_UPSERT = text(f"""
+_UPSERT = sa.text(f"""
 INSERT INTO {_NOTES} (projection, version, generation, revision, layout, views)
 VALUES (:projection, :version, :generation, :revision, :layout, :views)
 ON CONFLICT (projection) DO UPDATE SET version = excluded.version, generation = excluded.generation,
@@ -119,26 +103,26 @@ otherwise spends half of the time of opening on compiling the same statements ag
 
 _notes = table(
     _NOTES,
-    column("projection", Text()),
-    column("version", Integer()),
-    column("generation", Integer()),
-    column("revision", Integer()),
-    column("layout", Text()),
-    column("views", Text()),
+    sa.column("projection", sa.Text()),
+    sa.column("version", sa.Integer()),
+    sa.column("generation", sa.Integer()),
+    sa.column("revision", sa.Integer()),
+    sa.column("layout", sa.Text()),
+    sa.column("views", sa.Text()),
 )
-_is_known = and_(
-    _notes.c.generation == bindparam("number"),
-    _notes.c.revision == bindparam("revision"),
-    _notes.c.version == bindparam("of_version"),
+_is_known = sa.and_(
+    _notes.c.generation == sa.bindparam("number"),
+    _notes.c.revision == sa.bindparam("revision"),
+    _notes.c.version == sa.bindparam("of_version"),
 )
-_select_news = select(
+_select_news = sa.select(
     _notes.c.version,
     _notes.c.generation,
     _notes.c.revision,
-    case((not_(_is_known), _notes.c.layout)).label("layout"),
-    case((not_(_is_known), _notes.c.views)).label("views"),
-).where(_notes.c.projection == bindparam("name"))
-_SELECTS: Mapping[Hold | None, Select[Any]] = {
+    sa.case((sa.not_(_is_known), _notes.c.layout)).label("layout"),
+    sa.case((sa.not_(_is_known), _notes.c.views)).label("views"),
+).where(_notes.c.projection == sa.bindparam("name"))
+_SELECTS: Mapping[Hold | None, sa.Select[Any]] = {
     None: _select_news,  # SQLite has no row locks and needs none: its write transaction excludes all others
     "share": _select_news.with_for_update(read=True),
     "change": _select_news.with_for_update(),
@@ -193,16 +177,16 @@ async def read_generation(
     return _generation(row)
 
 
-def select_generation(name: str) -> Select[tuple[int, int]]:
+def select_generation(name: str) -> sa.Select[tuple[int, int]]:
     """Return the query of number and version of the generation under this key, for a query of its tables as well."""
-    return select(_notes.c.generation, _notes.c.version).where(_notes.c.projection == name)
+    return sa.select(_notes.c.generation, _notes.c.version).where(_notes.c.projection == name)
 
 
 async def read_generations(connection: AsyncConnection) -> dict[str, Generation]:
     """Read all generations, by key."""
     if not await dialect_of(connection).has_table(connection, _NOTES):
         return {}
-    rows = await connection.execute(select(_notes).order_by(_notes.c.projection))
+    rows = await connection.execute(sa.select(_notes).order_by(_notes.c.projection))
     return {row.projection: _generation(row) for row in rows}
 
 
@@ -236,7 +220,7 @@ async def write_generation(connection: AsyncConnection, name: str, generation: G
 
 async def delete_generation(connection: AsyncConnection, name: str) -> None:
     """Delete the row under this key."""
-    await connection.execute(delete(_notes).where(_notes.c.projection == name))
+    await connection.execute(sa.delete(_notes).where(_notes.c.projection == name))
 
 
 async def make_generation(connection: AsyncConnection, number: int) -> Generation:
@@ -355,17 +339,17 @@ def view_texts_of(
 class _Syntax:
     """A dialect of SQLAlchemy, equal to every other one that writes the same SQL: each engine has its own."""
 
-    dialect: Dialect = field(compare=False)
+    dialect: sa.Dialect = field(compare=False)
     name: str
     backslash: str
     """The SQL literal of a backslash; a setting of PostgreSQL doubles it."""
 
 
-def _syntax_of(dialect: Dialect) -> _Syntax:
-    return _Syntax(dialect, dialect.name, view_text(literal("\\", Text()), dialect))
+def _syntax_of(dialect: sa.Dialect) -> _Syntax:
+    return _Syntax(dialect, dialect.name, view_text(sa.literal("\\", sa.Text()), dialect))
 
 
-def built_in_texts(layout: Layout, tables: Tables, dialect: Dialect) -> dict[str, str]:
+def built_in_texts(layout: Layout, tables: Tables, dialect: sa.Dialect) -> dict[str, str]:
     """Return name and SQL of every view in front of these tables, except users' views and those of projections."""
     syntax = _syntax_of(dialect)
     return {name: _text_of(each, tables, syntax) for name, each in public_views(layout).items()}
@@ -390,7 +374,7 @@ def table_texts(
     tables: Mapping[str, Mapping[str, Storage]],
     generation: int,
     stored: _Stored,
-    dialect: Dialect,
+    dialect: sa.Dialect,
     placement: Placement = PLAIN,
 ) -> list[str]:
     """Return the statements that create these tables and their indexes."""
@@ -422,7 +406,7 @@ def _definitions(
         *others,
     ]
     if syntax.name == "postgresql":  # bytes are packed already, so that compressing them again only takes time
-        packed = [each.name for each in columns_in_order(table) if isinstance(each.type, LargeBinary)]
+        packed = [each.name for each in columns_in_order(table) if isinstance(each.type, sa.LargeBinary)]
         statements += [f"ALTER TABLE {table.name} ALTER COLUMN {each} SET STORAGE EXTERNAL" for each in packed]
     return tuple(statements)
 
@@ -472,7 +456,7 @@ async def make_materialised(connection: AsyncConnection, kept: MaterialisedView,
     create = str(CreateTable(rows).compile(dialect=connection.dialect)).rstrip()
     placement = await dialect_of(connection).placement(connection)
     await dialect_of(connection).execute_all(connection, placement.creation(create, rows.name, EPISODE))
-    index = Index(index_name(kept.table, EPISODE, generation), rows.c[EPISODE])
+    index = sa.Index(index_name(kept.table, EPISODE, generation), rows.c[EPISODE])
     await connection.execute(CreateIndex(index))
     await connection.execute(CreateTable(make_table(kept.progress, _PROGRESS, generation, stored)))
 
@@ -511,7 +495,7 @@ async def refresh_some(
             continue
         table, progress = physical_name(kept.table, generation), physical_name(kept.progress, generation)
         episodes = await connection.execute(
-            text(
+            sa.text(
                 f"SELECT source.number, source.folded FROM ({folded}) AS source"  # noqa: S608
                 f" LEFT JOIN {progress} AS progress ON progress.id = source.number"
                 " WHERE source.folded <> coalesce(progress.folded, 0) ORDER BY source.number LIMIT :limit"

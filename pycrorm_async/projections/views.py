@@ -19,24 +19,12 @@ from sqlalchemy.sql.selectable import CompoundSelect
 
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
+from pycrorm_async.projections import columns as table_columns
 from pycrorm_async.projections import derived_views
-from pycrorm_async.projections.columns import (
-    CORE,
-    EPISODE,
-    MARKED,
-    OF_NO_EPISODE,
-    OWN,
-    Layout,
-    Storage,
-    column_type,
-    columns_in_order,
-    leaf_columns,
-    make_table,
-)
 from pycrorm_async.world.pose import ObjectType
 
 View: TypeAlias = sa.Select[Any] | CompoundSelect[Any] | sa.TextualSelect
-_Columns: TypeAlias = tuple[tuple[str, Storage], ...]
+_Columns: TypeAlias = tuple[tuple[str, table_columns.Storage], ...]
 
 _UNITED_MAX = 400
 """Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
@@ -65,10 +53,12 @@ class Tables:
 
     def __getitem__(self, name: str) -> sa.Table:
         """Return a table that every memory has."""
-        return make_table(name, CORE.get(name) or OF_NO_EPISODE[name], self.generation, self.stored)
+        return table_columns.make_table(
+            name, table_columns.CORE.get(name) or table_columns.OF_NO_EPISODE[name], self.generation, self.stored
+        )
 
     def leaf(self, name: str, columns: _Columns) -> sa.Table:
-        return make_table(name, leaf_columns(dict(columns)), self.generation, self.stored)
+        return table_columns.make_table(name, table_columns.leaf_columns(dict(columns)), self.generation, self.stored)
 
     def shown(self, view: sa.Select[Any], rows: sa.Table) -> sa.Select[Any]:
         """Return the view without the rows of simulations, unless these views include them."""
@@ -82,7 +72,7 @@ class _Leaf(NamedTuple):
     members: tuple[tuple[str, _Columns], ...]
 
     @classmethod
-    def of(cls, name: str, layout: Layout) -> _Leaf:
+    def of(cls, name: str, layout: table_columns.Layout) -> _Leaf:
         members = ((each, tuple(layout.leaves[each].items())) for each in layout.members(name))
         return cls(tuple(layout.columns(name).items()), tuple(members))
 
@@ -100,9 +90,9 @@ class ViewDefinition(NamedTuple):
         return self.function(tables, *self.facts)
 
 
-def public_views(layout: Layout) -> dict[str, ViewDefinition]:
+def public_views(layout: table_columns.Layout) -> dict[str, ViewDefinition]:
     """Return name and definition of every view of this layout, except users' views."""
-    views = {name: ViewDefinition(_whole, (name,)) for name in CORE if name != "simulated_episode"}
+    views = {name: ViewDefinition(_whole, (name,)) for name in table_columns.CORE if name != "simulated_episode"}
     views |= {name: ViewDefinition(_cut, (name,)) for name in _CUT}
     views["designator"] = ViewDefinition(_designator, (_unusual_lineages(layout),))
     leaves = {name: _Leaf.of(name, layout) for name in layout.leaves}
@@ -117,19 +107,21 @@ def public_views(layout: Layout) -> dict[str, ViewDefinition]:
     return {**views, **{name: ViewDefinition(_of_concepts, (name,)) for name in derived_views.CONCEPT_VIEWS}}
 
 
-def projection_views(layout: Layout, number: int, tables: Tables) -> dict[str, View]:
+def projection_views(layout: table_columns.Layout, number: int, tables: Tables) -> dict[str, View]:
     """Return the views of a custom projection. `number` is the generation of its tables, `tables` are the built-in."""
     views: dict[str, View] = {}
     for name, columns in layout.leaves.items():
-        rows = make_table(name, leaf_columns(columns), number, tables.stored)
-        views[name.removeprefix(OWN)] = tables.shown(select(*map(_labelled, columns_in_order(rows))), rows)
+        rows = table_columns.make_table(name, table_columns.leaf_columns(columns), number, tables.stored)
+        views[name.removeprefix(table_columns.OWN)] = tables.shown(
+            select(*map(_labelled, table_columns.columns_in_order(rows))), rows
+        )
     return views
 
 
 def _whole(tables: Tables, name: str) -> View:
     """Return the view that shows a table unchanged."""
     rows = tables[name]
-    return tables.shown(select(*columns_in_order(rows), *_sequence(rows)), rows)
+    return tables.shown(select(*table_columns.columns_in_order(rows), *_sequence(rows)), rows)
 
 
 def _cut(tables: Tables, name: str) -> View:
@@ -161,9 +153,9 @@ def _of_concepts(_tables: Tables, name: str) -> View:
 
 def _happened(rows: sa.Table, simulations: sa.Table) -> sa.ColumnElement[bool]:
     """Return the condition that a row does not belong to a simulation."""
-    if rows.info[MARKED]:
+    if rows.info[table_columns.MARKED]:
         return ~rows.c.simulated
-    return derived_views.absent(rows.c[EPISODE], simulations.c.id)
+    return derived_views.absent(rows.c[table_columns.EPISODE], simulations.c.id)
 
 
 def _process_metadata(tables: Tables) -> sa.Select[Any]:
@@ -171,7 +163,7 @@ def _process_metadata(tables: Tables) -> sa.Select[Any]:
     world = sa.func.coalesce(
         episodes.c.world, episodes.c.entered_world, derived_views.world_line(tables, episodes.c.id)
     ).label("world")
-    columns = columns_in_order(episodes)
+    columns = table_columns.columns_in_order(episodes)
     first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
     return select(first, *others, _end(episodes.c.created_at, episodes).label("ended_at"), _duration_s(episodes))
 
@@ -228,7 +220,7 @@ def _task_tree_node(tables: Tables) -> sa.Select[Any]:
     outcome = derived_views.outcome_of(nodes).label("outcome")
     columns = (
         derived_views.failure_part(tables, each.key) if each.key in _FAILURE_PARTS else each
-        for each in columns_in_order(nodes)
+        for each in table_columns.columns_in_order(nodes)
         if each.key != "failure_node_id"
     )
     return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome)
@@ -284,7 +276,7 @@ def _designator(tables: Tables, unusual_lineages: tuple[tuple[str, str], ...]) -
     return tables.shown(view, nodes)
 
 
-def _unusual_lineages(layout: Layout) -> tuple[tuple[str, str], ...]:
+def _unusual_lineages(layout: table_columns.Layout) -> tuple[tuple[str, str], ...]:
     """Return the lineages of the types with bases or with another table name, and of former names."""
     unusual = (dtype for dtype, each in layout.types.items() if each.bases or each.tables != (table_name(dtype),))
     return tuple((dtype, layout.lineage(dtype)) for dtype in dict.fromkeys((*unusual, *layout.renamed)))
@@ -327,7 +319,10 @@ def _root_failure(tables: Tables) -> sa.Select[Any]:
 def _pose(tables: Tables) -> sa.Select[Any]:
     poses = tables["pose"]
     return select(
-        *columns_in_order(poses), *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id")
+        *table_columns.columns_in_order(poses),
+        *_sequence(poses),
+        poses.c.id.label("position_id"),
+        poses.c.id.label("orientation_id"),
     )
 
 
@@ -367,8 +362,10 @@ def _united_rows(tables: Tables, leaf: _Leaf) -> View:
         columns: list[sa.ColumnElement[Any]] = [rows.c.id]
         for each, storage in leaf.columns:
             same = own.get(each) == storage
-            columns.append(_labelled(rows.c[each]) if same else sa.cast(sa.null(), column_type(storage)).label(each))
-        columns += [rows.c[EPISODE]]
+            columns.append(
+                _labelled(rows.c[each]) if same else sa.cast(sa.null(), table_columns.column_type(storage)).label(each)
+            )
+        columns += [rows.c[table_columns.EPISODE]]
         if all(name != "sequence" for name, _ in leaf.columns):
             columns += _sequence(rows)
         parts.append(tables.shown(select(*columns), rows))

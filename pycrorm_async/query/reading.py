@@ -26,20 +26,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar, overload
 from weakref import ref
 
-from sqlalchemy import (
-    BinaryExpression,
-    ColumnElement,
-    Connection,
-    Dialect,
-    Result,
-    Row,
-    Select,
-    event,
-    func,
-    literal,
-    select,
-    table,
-)
+import sqlalchemy as sa
 from sqlalchemy.dialects import registry
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
@@ -296,7 +283,7 @@ class Reading:
                 async for batch in batches:
                     yield batch
 
-    async def _select_of(self, query: FrameQuery) -> Select[*tuple[Any, ...]]:
+    async def _select_of(self, query: FrameQuery) -> sa.Select[*tuple[Any, ...]]:
         question = query.question if isinstance(query, SyncQuestion) else query
         return await question.resolved() if isinstance(question, Question) else select_of(question)
 
@@ -324,14 +311,14 @@ class Reading:
         return Ask(partial(Question, self))
 
     @property
-    def dialect(self) -> Dialect:
+    def dialect(self) -> sa.Dialect:
         """The dialect of the database, to write a statement in its SQL."""
-        found: Dialect = registry.load("sqlite" if self._address.is_sqlite else "postgresql")()
+        found: sa.Dialect = registry.load("sqlite" if self._address.is_sqlite else "postgresql")()
         return found
 
     async def rows(
-        self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False
-    ) -> list[Row[*tuple[Any, ...]]]:
+        self, statement: sa.Select[*tuple[Any, ...]], *, simulated: bool = False
+    ) -> list[sa.Row[*tuple[Any, ...]]]:
         """Return the rows of a select over columns as named tuples."""
         await self._ready()
         with self._log.translated():
@@ -511,7 +498,7 @@ class Reading:
             self._classes.use_in(on_access.engine)
             explain = partial(_explain_absent, self._address)
             for engine in (log.engine, on_access.engine):
-                event.listen(engine.sync_engine, "handle_error", explain)
+                sa.event.listen(engine.sync_engine, "handle_error", explain)
             sessions = async_sessionmaker(
                 log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access
             )
@@ -551,9 +538,9 @@ class Reading:
         """Return whether the public views show all that is wanted; others are temporary, which no replica makes."""
         if not simulated or self._log.address != self._replica:
             return not simulated
-        simulations = table(physical_name("simulated_episode", (await _generation(self._log)).number))
+        simulations = sa.table(physical_name("simulated_episode", (await _generation(self._log)).number))
         async with self._log.reading() as connection:
-            return not (await connection.execute(select(literal(1)).select_from(simulations).limit(1))).all()
+            return not (await connection.execute(sa.select(sa.literal(1)).select_from(simulations).limit(1))).all()
 
 
 class _Source(NamedTuple):
@@ -622,7 +609,7 @@ class EpisodeSession(Session):
         self._connect = connect
         self._reference = self._refer()
 
-    def execute(self, *arguments: Any, **options: Any) -> Result[Any]:
+    def execute(self, *arguments: Any, **options: Any) -> sa.Result[Any]:
         """Execute a statement; a load of an attribute that is read without `await` runs in a thread of its own."""
         if in_greenlet():
             with collecting_seldom():
@@ -653,18 +640,18 @@ class EpisodeSession(Session):
         self.identity_map._wr = reference  # noqa: SLF001
         return reference
 
-    def _connection_for_bind(self, engine: Any, *arguments: Any, **options: Any) -> Connection:
+    def _connection_for_bind(self, engine: Any, *arguments: Any, **options: Any) -> sa.Connection:
         # There is no public way to execute a statement of a session on a connection outside its transaction.
         return self._on_access.connection or super()._connection_for_bind(engine, *arguments, **options)
 
 
-event.listen(EpisodeSession, "do_orm_execute", load_related)
+sa.event.listen(EpisodeSession, "do_orm_execute", load_related)
 
 
-@event.listens_for(EpisodeSession, "do_orm_execute")
+@sa.event.listens_for(EpisodeSession, "do_orm_execute")
 def _name_episode(state: ORMExecuteState) -> None:
     keys = state.parameters.get(KEYS) if isinstance(state.parameters, Mapping) else None
-    if not keys or not isinstance(state.statement, Select) or not all(isinstance(each, int) for each in keys):
+    if not keys or not isinstance(state.statement, sa.Select) or not all(isinstance(each, int) for each in keys):
         return
     number = row_key(min(keys)).number
     if number != row_key(max(keys)).number:
@@ -674,11 +661,15 @@ def _name_episode(state: ORMExecuteState) -> None:
         state.statement = state.statement.where(column.table.c[EPISODE] == number)
 
 
-def _loaded_by(statement: Select[Any]) -> Any:
+def _loaded_by(statement: sa.Select[Any]) -> Any:
     """Return the column that a load compares with the ids."""
-    criteria: ColumnElement[bool] | None = statement.whereclause
+    criteria: sa.ColumnElement[bool] | None = statement.whereclause
     for each in visitors.iterate(criteria) if criteria is not None else ():
-        if isinstance(each, BinaryExpression) and each.operator is in_op and getattr(each.right, "key", None) == KEYS:
+        if (
+            isinstance(each, sa.BinaryExpression)
+            and each.operator is in_op
+            and getattr(each.right, "key", None) == KEYS
+        ):
             return each.left
     return None
 
@@ -709,10 +700,10 @@ class LoadOnAccess:
         self.engine = engine
         self._translated = translated
         self._lock = Lock()
-        self._connection: ContextVar[Connection | None] = ContextVar("connection_of_load", default=None)
+        self._connection: ContextVar[sa.Connection | None] = ContextVar("connection_of_load", default=None)
 
     @property
-    def connection(self) -> Connection | None:
+    def connection(self) -> sa.Connection | None:
         """The connection of the load that runs in this context; None outside of loads."""
         return self._connection.get()
 
@@ -723,7 +714,7 @@ class LoadOnAccess:
     ) -> _Result:
         """Run a load with a connection from `connect`, and wait for its result. Raises as the load does."""
 
-        def with_connection(connection: Connection) -> _Result:
+        def with_connection(connection: sa.Connection) -> _Result:
             self._connection.set(connection)
             return load()
 
@@ -769,7 +760,7 @@ async def _read(address: DatabaseAddress) -> str:
 
     try:
         async with Reading.open_address(address) as reading, reading.session() as session:
-            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
+            total = await session.scalar(sa.select(sa.func.count()).select_from(ProcessMetaData))
             newest = await named_queries.episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
             folding = len(await (await reading.log()).behind())
             return episodes_html(newest, total or 0, folding=folding)

@@ -40,17 +40,8 @@ from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, i
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store import schema
+from pycrorm_async.store import stored as storeds
 from pycrorm_async.store.dialect import DECLARATIONS, Dialect, Insertion, RowRefused
-from pycrorm_async.store.stored import (
-    BLOCK_EVENTS,
-    DigestRow,
-    EpisodeRow,
-    RemovedEpisode,
-    RunningDigest,
-    Span,
-    Stored,
-    StoredEvent,
-)
 
 # === append rules =============================================================================================
 #
@@ -84,7 +75,7 @@ class EpisodeStep:
     `skipped_ends` counts the computed ends that are left out.
     """
 
-    after: EpisodeRow
+    after: storeds.EpisodeRow
     fresh: list[Record]
     again: list[Record] = field(default_factory=list)
     skipped_ends: int = 0
@@ -106,7 +97,7 @@ def sort(records: Iterable[Record]) -> SortedBatch:
     return SortedBatch(declarations, episodes)
 
 
-def step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
+def step(records: Sequence[Record], row: storeds.EpisodeRow) -> EpisodeStep:
     """Compute the effect of these records, all of one episode, on its row."""
     first = records[0].sequence
     if first == row.head + 1 and _consecutive(records) and _sound(records):
@@ -114,17 +105,17 @@ def step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
     return _careful_step(records, row)
 
 
-def differing(again: Iterable[Record], stored: Mapping[int, StoredEvent]) -> int | None:
+def differing(again: Iterable[Record], stored: Mapping[int, storeds.StoredEvent]) -> int | None:
     """Return the first sequence whose stored event differs from the record; None if all are equal."""
     return min((each.sequence for each in again if not _same(each, stored.get(each.sequence))), default=None)
 
 
-def _same(record: Record, stored: StoredEvent | None) -> bool:
+def _same(record: Record, stored: storeds.StoredEvent | None) -> bool:
     # From the type on, a record and a stored event have the same fields in the same order.
     return stored is not None and tuple(record[3:]) == tuple(stored[2:])
 
 
-def _careful_step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
+def _careful_step(records: Sequence[Record], row: storeds.EpisodeRow) -> EpisodeStep:
     fresh: list[Record] = []
     again: list[Record] = []
     refused: str | None = None
@@ -160,7 +151,7 @@ def _refusal(record: Record, expected: int) -> str | None:
     return None
 
 
-def _advanced(row: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> EpisodeRow:
+def _advanced(row: storeds.EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> storeds.EpisodeRow:
     if not fresh:  # repeats alone do not end an earlier refusal
         return row._replace(refused=row.refused or refused)
     last = fresh[-1]
@@ -222,8 +213,8 @@ _EPISODES_MAX: Final = 1_000
 class Extension:
     """The digests after an append: rows to insert, and running digests by number; None: the episode gets no digests."""
 
-    def __init__(self, running: Mapping[int, RunningDigest | None]) -> None:
-        self.rows: list[DigestRow] = []
+    def __init__(self, running: Mapping[int, storeds.RunningDigest | None]) -> None:
+        self.rows: list[storeds.DigestRow] = []
         self.running = running
 
     def add(self, number: int, events: Sequence[Record], *, last: bool = False) -> None:
@@ -231,9 +222,9 @@ class Extension:
         digest = self.running[number]
         if digest is None:
             return
-        self.rows += [DigestRow(number, *each) for each in digest.add(events)]
-        if last and digest.sequence % BLOCK_EVENTS:
-            self.rows.append(DigestRow(number, digest.sequence, digest.digest()))
+        self.rows += [storeds.DigestRow(number, *each) for each in digest.add(events)]
+        if last and digest.sequence % storeds.BLOCK_EVENTS:
+            self.rows.append(storeds.DigestRow(number, digest.sequence, digest.digest()))
 
 
 class RunningDigests:
@@ -242,9 +233,9 @@ class RunningDigests:
     def __init__(self, dialect: Dialect) -> None:
         self._dialect = dialect
         self._insertable: bool | None = None
-        self._running: dict[int, RunningDigest | None] = {}
+        self._running: dict[int, storeds.RunningDigest | None] = {}
 
-    async def begin(self, connection: AsyncConnection, rows: Iterable[EpisodeRow]) -> Extension | None:
+    async def begin(self, connection: AsyncConnection, rows: Iterable[storeds.EpisodeRow]) -> Extension | None:
         """Begin an append to the episodes of these rows; None if digests cannot be stored."""
         if self._insertable is None:
             self._insertable = (await self._dialect.table_state(connection, schema.DIGEST)).insertable
@@ -268,23 +259,23 @@ class RunningDigests:
         while len(self._running) > _EPISODES_MAX:
             del self._running[next(iter(self._running))]
 
-    async def _at_head(self, connection: AsyncConnection, row: EpisodeRow) -> RunningDigest | None:
+    async def _at_head(self, connection: AsyncConnection, row: storeds.EpisodeRow) -> storeds.RunningDigest | None:
         """Return a running digest at the episode's head, to be changed by the caller; None if it cannot continue."""
         if row.number in self._running:
             kept = self._running[row.number]
             if kept is None or kept.sequence == row.head:
                 return kept and kept.copy()
-        start = row.head - row.head % BLOCK_EVENTS
+        start = row.head - row.head % storeds.BLOCK_EVENTS
         if start == 0:
-            running = RunningDigest.at_start(row.identity)
+            running = storeds.RunningDigest.at_start(row.identity)
         else:
             at = {"number": row.number, "sequence": start}
             at_start = (await self._dialect.execute(connection, schema.SELECT_DIGEST, **at)).scalar()
             if at_start is None:
                 return None
-            running = RunningDigest(bytes.fromhex(at_start), start)
+            running = storeds.RunningDigest(bytes.fromhex(at_start), start)
         if row.head > start:
-            running.add(await self._dialect.spans(connection, [Span(row.number, start, row.head)]))
+            running.add(await self._dialect.spans(connection, [storeds.Span(row.number, start, row.head)]))
         return running if running.sequence == row.head else None  # else events are missing, which `verify` reports
 
 
@@ -302,7 +293,7 @@ class StoredAhead(InternalError):
 class _Plan(NamedTuple):
     """The changes that the batch makes to episodes whose rows are `known_rows`."""
 
-    known_rows: Mapping[EpisodeId, EpisodeRow]
+    known_rows: Mapping[EpisodeId, storeds.EpisodeRow]
     steps: Mapping[EpisodeId, EpisodeStep]
     insertion: Insertion
     digests: Extension | None
@@ -337,7 +328,7 @@ class Appending:
         self._plan: _Plan | None = None
         self.warnings: dict[str, str] = {}
         """Warnings of limits that the batch came near, by "numbers" or an episode's id."""
-        self.discarded: dict[EpisodeId, RemovedEpisode] = {}
+        self.discarded: dict[EpisodeId, storeds.RemovedEpisode] = {}
         """The episodes of the batch that were removed from the log, and whose events are not stored again."""
         self.extension: Extension | None = None
         """The digests that `write` inserted, to be kept after the commit."""
@@ -346,7 +337,7 @@ class Appending:
         """Read the episodes in a reading transaction and build the statements for them. Optional."""
         self._plan = await self._make_plan(connection, await self._read_rows(connection))
 
-    async def write(self, connection: AsyncConnection) -> Stored:
+    async def write(self, connection: AsyncConnection) -> storeds.Stored:
         """Append the batch in the caller's transaction.
 
         Raises `LogWentBack` if the log holds less of the witness than it had confirmed, and `LogDamaged` if another
@@ -357,7 +348,7 @@ class Appending:
             await _insert_declarations(dialect, connection, batch.declarations)
         if not batch.episodes:
             await dialect.force_durable_commit(connection)  # all declarations may be repeats
-            return Stored({}, {})
+            return storeds.Stored({}, {})
         known_rows, refusals = await self._read_or_create_rows(connection)
         plan = self._plan
         if plan is None or plan.known_rows != known_rows:
@@ -385,7 +376,7 @@ class Appending:
             each: change.after.refused for each, change in plan.steps.items() if _has_unstored(batch, each, change)
         }
         refusals |= {each: reason for each, reason in stopped.items() if reason is not None}
-        return Stored(refusals, {each: change.after for each, change in plan.steps.items()})
+        return storeds.Stored(refusals, {each: change.after for each, change in plan.steps.items()})
 
     async def create_rows(self, connection: AsyncConnection) -> None:
         """Create the rows of the batch's new episodes, without events."""
@@ -396,23 +387,25 @@ class Appending:
         new = [(*row[:3], row.started_wall_ns, None, None) for each, row in rows.items() if each not in present]
         await self._dialect.execute(connection, schema.UPSERT_EPISODES, rows=new)
 
-    async def _make_plan(self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
+    async def _make_plan(
+        self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, storeds.EpisodeRow]
+    ) -> _Plan:
         steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
         extending = [known_rows[each] for each, change in steps.items() if change.fresh]
         digests = None if self._digests is None else await self._digests.begin(connection, extending)
         insertion = await self._dialect.event_insertion(_parts_of(steps.values(), digests))
         return _Plan(known_rows, steps, insertion, digests)
 
-    async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
+    async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, storeds.EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""
         names = {episode_text(each): each for each in self._batch.episodes}
         witness, confirmed = self._witness or (None, 0)
         ids = [(each,) for each in names]
         if witness is None:
-            rows = await self._dialect.rows(connection, EpisodeRow, schema.LOCK_EPISODES, ids=ids)
+            rows = await self._dialect.rows(connection, storeds.EpisodeRow, schema.LOCK_EPISODES, ids=ids)
         else:
             name, statement = episode_text(witness), schema.LOCK_EPISODES_AND_READ_WITNESS
-            rows = await self._dialect.rows(connection, EpisodeRow, statement, ids=ids, witness=name)
+            rows = await self._dialect.rows(connection, storeds.EpisodeRow, statement, ids=ids, witness=name)
             head = max((row.head for row in rows if row.id == name), default=0)
             if head < confirmed and not await removed_of(self._dialect, connection, [witness]):
                 raise LogWentBack(name, confirmed, head)
@@ -420,7 +413,7 @@ class Appending:
 
     async def _read_or_create_rows(
         self, connection: AsyncConnection
-    ) -> tuple[dict[EpisodeId, EpisodeRow], dict[EpisodeId, str]]:
+    ) -> tuple[dict[EpisodeId, storeds.EpisodeRow], dict[EpisodeId, str]]:
         """Read the rows, and create those of new episodes; return also why some episodes cannot get one."""
         rows = await self._read_rows(connection)
         refusals: dict[EpisodeId, str] = {}
@@ -447,7 +440,9 @@ class Appending:
                 refusals[each] = f"all {most:,} episode numbers of this memory are used: {_room(most, _MOVE)}"
             else:
                 started_ns = self._batch.episodes[each][0].wall_ns
-                rows[each] = EpisodeRow(number, episode_text(each), head=0, folded=0, started_wall_ns=started_ns)
+                rows[each] = storeds.EpisodeRow(
+                    number, episode_text(each), head=0, folded=0, started_wall_ns=started_ns
+                )
         return rows, refusals
 
     async def _assign_numbers(self, connection: AsyncConnection, missing: Sequence[EpisodeId]) -> dict[EpisodeId, int]:
@@ -466,7 +461,7 @@ class Appending:
 
 async def removed_of(
     dialect: Dialect, connection: AsyncConnection, episodes: Iterable[EpisodeId]
-) -> dict[EpisodeId, RemovedEpisode]:
+) -> dict[EpisodeId, storeds.RemovedEpisode]:
     """Return those of these episodes that were erased or archived."""
     names = {episode_text(each): each for each in episodes}
     rows = await dialect.removed(connection, schema.SELECT_REMOVED_BY_ID, ids=[(each,) for each in names])
@@ -518,8 +513,8 @@ async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequenc
     if not steps:
         return
     keys = [(each.after.number, record.sequence) for each in steps for record in each.again]
-    stored: dict[int, dict[int, StoredEvent]] = {}
-    for event in await dialect.rows(connection, StoredEvent, schema.SELECT_EVENTS_BY_KEY, keys=keys):
+    stored: dict[int, dict[int, storeds.StoredEvent]] = {}
+    for event in await dialect.rows(connection, storeds.StoredEvent, schema.SELECT_EVENTS_BY_KEY, keys=keys):
         stored.setdefault(event.number, {})[event.sequence] = event
     for each in steps:
         sequence = differing(each.again, stored.get(each.after.number, {}))
@@ -563,7 +558,7 @@ def _room(most: int, advice: str) -> str:
     return f"the login that owns the log makes room for {EPISODE_NUMBER_MAX:,} with `pycrorm writer --once`"
 
 
-def events_warning(episode: EpisodeRow) -> str | None:
+def events_warning(episode: storeds.EpisodeRow) -> str | None:
     """Return the warning for an episode that has not ended; None below nine tenths."""
     if episode.head < EVENTS_MANY or episode.ended_wall_ns is not None:
         return None
@@ -574,7 +569,7 @@ def events_warning(episode: EpisodeRow) -> str | None:
     )
 
 
-def warnings_of(episodes: Sequence[EpisodeRow]) -> dict[str, str]:
+def warnings_of(episodes: Sequence[storeds.EpisodeRow]) -> dict[str, str]:
     """Return the warnings for these rows, by "numbers" or an episode's id."""
     last = max((each.number for each in episodes), default=0)
     warnings = {"numbers": number_warning(last)} | {each.id: events_warning(each) for each in episodes}

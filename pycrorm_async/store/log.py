@@ -30,32 +30,14 @@ from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, is_episode_id, number_in
 from pycrorm_async.settings import FILE_MODES, FileAccess
+from pycrorm_async.store import append as appends
 from pycrorm_async.store import schema
+from pycrorm_async.store import stored as storeds
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
-from pycrorm_async.store.append import (
-    EVENTS_MANY,
-    Appending,
-    Blobs,
-    RunningDigests,
-    StoredAhead,
-    events_warning,
-    number_warning,
-    removed_of,
-)
 from pycrorm_async.store.dialect import LogIdentity, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
-from pycrorm_async.store.stored import (
-    DigestRow,
-    EpisodeRow,
-    Incarnation,
-    RemovedEpisode,
-    Span,
-    Stored,
-    StoredEvent,
-    consecutive,
-)
 
 _log = logging.getLogger("pycrorm_async")
 _MANY_EVENTS = 1_000
@@ -88,8 +70,8 @@ class EventLog:
         self.discarded: dict[str, int] = {}
         """The number of events that arrived of removed episodes and were discarded, by the id of the episode."""
         self._shards: bool | None = False if address.is_sqlite else None
-        self.blobs = Blobs(self._dialect, self.reading, self.writing)
-        self.digests: RunningDigests | None = RunningDigests(self._dialect)
+        self.blobs = appends.Blobs(self._dialect, self.reading, self.writing)
+        self.digests: appends.RunningDigests | None = appends.RunningDigests(self._dialect)
         """The digests of the episodes that this process appends to; None, for a benchmark, stores none."""
 
     @classmethod
@@ -170,23 +152,23 @@ class EventLog:
         *,
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
-    ) -> Stored:
+    ) -> storeds.Stored:
         """Append; give a new episode its number in `numbers` if no other episode has it.
 
         Raises `LogWentBack`, and stores nothing, if the log holds less of the witness than this head.
         """
         if not records:
-            return Stored({}, {})
+            return storeds.Stored({}, {})
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
             if not await self._has_shards():
                 return await self._append(records, witness=witness, numbers=numbers)
             async with self.writing() as connection:  # before an event with its number is on a shard
-                rows = Appending(self._dialect, records, numbers=numbers, restoring=self.blobs.restores)
+                rows = appends.Appending(self._dialect, records, numbers=numbers, restoring=self.blobs.restores)
                 await rows.create_rows(connection)
             try:
                 return await self._append(records, witness=witness, numbers=numbers)
-            except StoredAhead:
+            except appends.StoredAhead:
                 await self._adopt({each.episode for each in records if each.episode is not None})
                 return await self._append(records, witness=witness, numbers=numbers)
 
@@ -198,7 +180,7 @@ class EventLog:
     async def _adopt(self, episodes: Collection[EpisodeId]) -> None:
         """Advance the heads of these episodes over events that a crash left on a shard (`store.placement`)."""
         for row in (await self.heads(list(episodes))).values():
-            ahead = await self.spans([Span(row.number, row.head, SEQUENCE_MAX)])
+            ahead = await self.spans([storeds.Span(row.number, row.head, SEQUENCE_MAX)])
             if ahead:
                 records = [Record(0, row.identity, *each[1:]) for each in ahead]
                 await self._append(records, are_stored=True)
@@ -211,8 +193,8 @@ class EventLog:
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
         are_stored: bool = False,
-    ) -> Stored:
-        appending = Appending(
+    ) -> storeds.Stored:
+        appending = appends.Appending(
             self._dialect,
             records,
             self.digests,
@@ -244,10 +226,10 @@ class EventLog:
         with self.translated():
             await self.blobs.store_for(records)
 
-    async def heads(self, episodes: Sequence[EpisodeId]) -> dict[EpisodeId, EpisodeRow]:
+    async def heads(self, episodes: Sequence[EpisodeId]) -> dict[EpisodeId, storeds.EpisodeRow]:
         """Read the rows of these episodes, without those that have no stored event."""
         names = {episode_text(each): each for each in episodes}
-        rows = await self.read(EpisodeRow, schema.SELECT_HEADS, ids=[(each,) for each in names])
+        rows = await self.read(storeds.EpisodeRow, schema.SELECT_HEADS, ids=[(each,) for each in names])
         return {names[row.id]: row for row in rows}
 
     async def skip_numbers(self, above: int) -> None:
@@ -261,15 +243,15 @@ class EventLog:
         with self.translated():
             async with self.writing() as connection:
                 await self._dialect.create_if_missing(connection, schema.INCARNATION)
-                incarnation = Incarnation(noticed_wall_ns, noticed_by, reason)
+                incarnation = storeds.Incarnation(noticed_wall_ns, noticed_by, reason)
                 await self._dialect.execute(connection, schema.INSERT_INCARNATION, **incarnation._asdict())
 
-    async def incarnations(self) -> list[Incarnation]:
+    async def incarnations(self) -> list[storeds.Incarnation]:
         """Read each time the log went back, the oldest first."""
         async with self.reading() as connection:
             if not (await self._dialect.table_state(connection, schema.INCARNATION)).exists:
                 return []
-            return await self._dialect.rows(connection, Incarnation, schema.SELECT_INCARNATIONS)
+            return await self._dialect.rows(connection, storeds.Incarnation, schema.SELECT_INCARNATIONS)
 
     async def placement(self) -> Placement:
         """Return the placement of the memory's rows."""
@@ -298,38 +280,42 @@ class EventLog:
         async with self.reading() as connection:
             return await self._dialect.rows(connection, kind, statement, **values)
 
-    async def episodes(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> list[EpisodeRow]:
+    async def episodes(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> list[storeds.EpisodeRow]:
         """Read every episode from number `first` to `last`, by number."""
-        return await self.read(EpisodeRow, schema.SELECT_EPISODES, first=first, last=last, limit=EPISODE_NUMBER_MAX)
+        return await self.read(
+            storeds.EpisodeRow, schema.SELECT_EPISODES, first=first, last=last, limit=EPISODE_NUMBER_MAX
+        )
 
     async def last_number(self) -> int:
         """Return the highest episode number; 0 for a log without episodes."""
         [(number,)] = await self.read(tuple, schema.SELECT_NUMBER_MAX)
         return int(number)
 
-    async def episode(self, episode: EpisodeId) -> EpisodeRow | None:
+    async def episode(self, episode: EpisodeId) -> storeds.EpisodeRow | None:
         """Read an episode's row; None if no event of it is stored."""
         return (await self.heads([episode])).get(episode)
 
-    async def last_digests(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> dict[int, DigestRow]:
+    async def last_digests(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> dict[int, storeds.DigestRow]:
         """Read the last kept digest of each episode from number `first` to `last` that has one, by number."""
         async with self.reading() as connection:
             if not (await self._dialect.table_state(connection, schema.DIGEST)).readable:
                 return {}
-            rows = await self._dialect.rows(connection, DigestRow, schema.SELECT_LAST_DIGESTS, first=first, last=last)
+            rows = await self._dialect.rows(
+                connection, storeds.DigestRow, schema.SELECT_LAST_DIGESTS, first=first, last=last
+            )
         return {each.number: each for each in rows}
 
-    async def removed(self, episodes: Collection[EpisodeId]) -> dict[EpisodeId, RemovedEpisode]:
+    async def removed(self, episodes: Collection[EpisodeId]) -> dict[EpisodeId, storeds.RemovedEpisode]:
         """Read which of these episodes were erased or archived."""
         async with self.reading() as connection:
-            return await removed_of(self._dialect, connection, episodes)
+            return await appends.removed_of(self._dialect, connection, episodes)
 
-    async def restored(self, ids: Iterable[str]) -> list[RemovedEpisode]:
+    async def restored(self, ids: Iterable[str]) -> list[storeds.RemovedEpisode]:
         """Return those of these episodes that came back from a lake, which has them still."""
         async with self.reading() as connection:
             return await self._dialect.removed(connection, schema.SELECT_RESTORED, ids=[(each,) for each in ids])
 
-    async def all_removed(self) -> list[RemovedEpisode]:
+    async def all_removed(self) -> list[storeds.RemovedEpisode]:
         """Read every erased and archived episode, by number."""
         async with self.reading() as connection:
             return await self._dialect.removed(connection, schema.SELECT_REMOVED)
@@ -339,41 +325,47 @@ class EventLog:
         row = await self.episode(episode)
         return row.number if row is not None else None
 
-    async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
+    async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[storeds.StoredEvent]:
         """Read at most `limit` events of an episode, behind sequence `after`."""
-        return await self.read(StoredEvent, schema.SELECT_EVENTS, number=number, after=after, limit=limit)
+        return await self.read(storeds.StoredEvent, schema.SELECT_EVENTS, number=number, after=after, limit=limit)
 
-    async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
+    async def pages(
+        self, episode: storeds.EpisodeRow, *, after: int = 0
+    ) -> AsyncIterator[Sequence[storeds.StoredEvent]]:
         """Yield the events up to the episode's head in pages. Raises `LogDamaged` at the first missing event."""
         while after < episode.head:
             limit = min(_PAGE_EVENTS, episode.head - after)
-            whole = consecutive(await self.events(episode.number, after=after, limit=limit), after)
+            whole = storeds.consecutive(await self.events(episode.number, after=after, limit=limit), after)
             if whole:
                 yield whole
             after += len(whole)
             if len(whole) < limit:
                 raise LogDamaged(episode.id, after + 1, f"is missing in {self.address}")
 
-    async def spans(self, spans: Sequence[Span]) -> list[StoredEvent]:
+    async def spans(self, spans: Sequence[storeds.Span]) -> list[storeds.StoredEvent]:
         """Read the events of each span, in the order of the spans."""
         async with self.reading() as connection:
             return await self._dialect.spans(connection, spans)
 
-    async def behind(self, after: int = 0, limit: int = EPISODE_NUMBER_MAX) -> list[EpisodeRow]:
+    async def behind(self, after: int = 0, limit: int = EPISODE_NUMBER_MAX) -> list[storeds.EpisodeRow]:
         """Read the episodes with unfolded events whose number is above `after`, by number, without parked ones."""
-        return await self.read(EpisodeRow, schema.SELECT_BEHIND, after=after, limit=limit, part=0, many=1)
+        return await self.read(storeds.EpisodeRow, schema.SELECT_BEHIND, after=after, limit=limit, part=0, many=1)
 
-    async def stopped(self) -> list[EpisodeRow]:
+    async def stopped(self) -> list[storeds.EpisodeRow]:
         """Read the refused and parked episodes; the rows hold the reasons."""
-        return await self.read(EpisodeRow, schema.SELECT_STOPPED)
+        return await self.read(storeds.EpisodeRow, schema.SELECT_STOPPED)
 
     async def limits_near(self) -> list[str]:
         """Return a warning for each limit of numbers that the memory, or an episode that has not ended, comes near."""
         last = await self.last_number()
         async with self.reading() as connection:
             most = await self._dialect.number_max(connection)
-        episodes = await self.read(EpisodeRow, schema.SELECT_LONG, events_min=EVENTS_MANY)
-        return [each for each in (number_warning(last, most), *map(events_warning, episodes)) if each is not None]
+        episodes = await self.read(storeds.EpisodeRow, schema.SELECT_LONG, events_min=appends.EVENTS_MANY)
+        return [
+            each
+            for each in (appends.number_warning(last, most), *map(appends.events_warning, episodes))
+            if each is not None
+        ]
 
     async def declarations(self) -> list[bytes]:
         """Read the payloads of all DesignatorTypeDeclared, in the order of first arrival."""
@@ -618,7 +610,7 @@ def _present(listed: int) -> str:
     return f"`pycrorm episodes` lists {'the only one' if listed == 1 else f'all {listed}'}"
 
 
-async def episode_named(log: EventLog, name: str) -> EpisodeRow:
+async def episode_named(log: EventLog, name: str) -> storeds.EpisodeRow:
     """Find the named episode. Raises `UnknownEpisode`."""
     last = await log.last_number() if name == "last" else 0
     while last > 0:
@@ -635,12 +627,12 @@ async def episode_named(log: EventLog, name: str) -> EpisodeRow:
     return row
 
 
-async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int]) -> list[EpisodeRow]:
+async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int]) -> list[storeds.EpisodeRow]:
     """Read the episodes that may have grown: with a number above `above`, not ended, or with one of these numbers."""
-    return await log.read(EpisodeRow, schema.SELECT_GROWN, above=above, numbers=[(each,) for each in numbers])
+    return await log.read(storeds.EpisodeRow, schema.SELECT_GROWN, above=above, numbers=[(each,) for each in numbers])
 
 
-async def tags_of(log: EventLog, row: EpisodeRow) -> tuple[str, ...]:
+async def tags_of(log: EventLog, row: storeds.EpisodeRow) -> tuple[str, ...]:
     """Return the tags of an episode according to its events. Raises `LogDamaged` if one of these cannot be read."""
     tags: tuple[str, ...] = ()
     for sequence, payload in await log.read(tuple, schema.SELECT_TAGGING, number=row.number):
@@ -664,7 +656,7 @@ class _Started(msgspec.Struct):
     simulated: bool = False
 
 
-async def is_simulated(log: EventLog, row: EpisodeRow) -> bool:
+async def is_simulated(log: EventLog, row: storeds.EpisodeRow) -> bool:
     """Return whether the episode is a simulation, according to its first event."""
     first = await log.events(row.number, limit=1)
     try:

@@ -18,21 +18,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from pycrorm_async import errors
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.drain import (
-    PATIENT,
-    TOO_MANY_EVENTS,
-    Destination,
-    Drain,
-    DrainState,
-    ExternalDrain,
-    OfferedQueue,
-    OpeningSteps,
-    Patience,
-    PatienceEnded,
-    Source,
-    retry,
-    run_to_completion,
-)
+from pycrorm_async.writer import drain as drains
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
@@ -50,8 +36,8 @@ class WriterState(NamedTuple):
         adoption_errors: the dead recorders' folders that could not be drained, with the reasons.
     """
 
-    queue: DrainState
-    adopted: tuple[DrainState, ...]
+    queue: drains.DrainState
+    adopted: tuple[drains.DrainState, ...]
     failure: str | None
     fold_error: str | None
     adoption_errors: tuple[str, ...]
@@ -62,10 +48,10 @@ class BackgroundWriter:
 
     def __init__(
         self,
-        source: Source,
-        destination: Destination,
+        source: drains.Source,
+        destination: drains.Destination,
         *,
-        adopt: Callable[[], Iterable[Source]],
+        adopt: Callable[[], Iterable[drains.Source]],
         settings: Settings,
         randomness: Callable[[], float] = random.random,
     ) -> None:
@@ -74,8 +60,8 @@ class BackgroundWriter:
         self._settings = settings
         self._randomness = randomness
         self._appended_events = asyncio.Event()
-        self._drain = Drain(source, destination.append, settings=settings, on_append=self._note_append)
-        self._adopted: list[Drain] = []
+        self._drain = drains.Drain(source, destination.append, settings=settings, on_append=self._note_append)
+        self._adopted: list[drains.Drain] = []
         self._adoption_errors: list[str] = []
         self._not_adopted: list[str] = []
         self._folding = asyncio.Lock()
@@ -115,11 +101,11 @@ class BackgroundWriter:
         Raises the error that stopped appending, `EpisodeParked` for episodes that stopped since `run` began, and
         `FlushTimeout` after `flush_timeout_s` without progress.
         """
-        patience = Patience(self._settings.flush_timeout_s, progress=lambda: self.progress)
+        patience = drains.Patience(self._settings.flush_timeout_s, progress=lambda: self.progress)
         try:
             await patience.run(self._flush(position), name="pycrorm flush")
-        except PatienceEnded:
-            reason = self._drain.state.unavailable or self._fold_error or TOO_MANY_EVENTS
+        except drains.PatienceEnded:
+            reason = self._drain.state.unavailable or self._fold_error or drains.TOO_MANY_EVENTS
             raise errors.FlushTimeout(patience.limit_s, reason) from None
 
     async def _flush(self, position: int) -> None:
@@ -167,8 +153,8 @@ class BackgroundWriter:
 
     async def _retry(self, operation: Callable[[], Awaitable[_T]]) -> _T:
         """Retry while the database is unavailable; the caller bounds the time."""
-        result = await retry(
-            operation, backoff=PATIENT, on_unavailable=self._mark_unavailable, randomness=self._randomness
+        result = await drains.retry(
+            operation, backoff=drains.PATIENT, on_unavailable=self._mark_unavailable, randomness=self._randomness
         )
         self._fold_error = None
         return result
@@ -195,10 +181,10 @@ class BackgroundWriter:
 
     async def _adopt_all(self) -> None:
         # Recovering folders reads files; in a thread, so that it does not delay our own queue.
-        sources: Iterator[Source] = iter(())
+        sources: Iterator[drains.Source] = iter(())
         try:
-            sources = await run_to_completion(asyncio.to_thread(lambda: iter(self._adopt())))
-            while (source := await run_to_completion(asyncio.to_thread(next, sources, None))) is not None:
+            sources = await drains.run_to_completion(asyncio.to_thread(lambda: iter(self._adopt())))
+            while (source := await drains.run_to_completion(asyncio.to_thread(next, sources, None))) is not None:
                 await self._drain_adopted(source)
         except Exception as error:  # noqa: BLE001 - in the state; must not stop our own queue
             self._adoption_errors.append(str(error))
@@ -207,8 +193,8 @@ class BackgroundWriter:
                 sources.close()  # releases the folder that the generator holds
             self._report_not_adopted()
 
-    async def _drain_adopted(self, source: Source) -> None:
-        drain = Drain(
+    async def _drain_adopted(self, source: drains.Source) -> None:
+        drain = drains.Drain(
             source,
             self._destination.append,
             settings=self._settings,
@@ -269,7 +255,7 @@ class DelegatedWriter:
     Belongs to the plan's loop.
     """
 
-    def __init__(self, queue: OfferedQueue, settings: Settings, process: PrivateProcess | None = None) -> None:
+    def __init__(self, queue: drains.OfferedQueue, settings: Settings, process: PrivateProcess | None = None) -> None:
         self.process = process
         self._queue = queue
         self._settings = settings
@@ -316,10 +302,10 @@ class DelegatedWriter:
     ) -> str | None:
         """Wait until the records up to this position are visible; return the hindrance if the wait reached a limit."""
         before = self._status.stored
-        patience = Patience(self._settings.flush_timeout_s, progress=lambda: self._progress)
+        patience = drains.Patience(self._settings.flush_timeout_s, progress=lambda: self._progress)
         try:
             visible = await patience.run(self._poll(position, undrained_s_max, on_poll), name="pycrorm wait for daemon")
-        except PatienceEnded:
+        except drains.PatienceEnded:
             visible = False
         return None if visible else self._hindrance(before)
 
@@ -342,7 +328,7 @@ class DelegatedWriter:
         return self._queue.is_drained or (self.process is not None and self.process.is_running)
 
     @property
-    def _status(self) -> ExternalDrain:
+    def _status(self) -> drains.ExternalDrain:
         status = self._queue.external_drain_status
         assert status is not None, "the queue is offered to a daemon"
         return status
@@ -379,7 +365,7 @@ class DelegatedWriter:
         drainer = "daemon" if self.process is None else "writer process"
         if status.note.unavailable is not None:
             return f"the {drainer} reports that the database is unavailable: {status.note.unavailable}"
-        return f"the {drainer} makes no progress" if status.stored == before else TOO_MANY_EVENTS
+        return f"the {drainer} makes no progress" if status.stored == before else drains.TOO_MANY_EVENTS
 
     def _raise_stopped(self) -> None:
         stopped = dict(self._status.note.stopped)
@@ -430,9 +416,9 @@ class WriterThread:
     def __init__(
         self,
         *,
-        source: Source,
-        open_destination: Callable[[], AbstractAsyncContextManager[Destination]],
-        adopt: Callable[[], Iterable[Source]],
+        source: drains.Source,
+        open_destination: Callable[[], AbstractAsyncContextManager[drains.Destination]],
+        adopt: Callable[[], Iterable[drains.Source]],
         settings: Settings,
         local: bool = False,
     ) -> None:
@@ -520,12 +506,12 @@ class WriterThread:
         return self._opened.result(timeout=0).state
 
     @property
-    def _patience(self) -> Patience:
+    def _patience(self) -> drains.Patience:
         writer = self._opened.result(timeout=0)
-        return Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
+        return drains.Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
 
     def _timeout_error(self) -> errors.FlushTimeout:
-        reason = self.state.queue.unavailable or TOO_MANY_EVENTS
+        reason = self.state.queue.unavailable or drains.TOO_MANY_EVENTS
         return errors.FlushTimeout(self._settings.flush_timeout_s, f"closed with work left: {reason}")
 
     def _request_stop(self, *, cancel: bool) -> None:
@@ -572,14 +558,14 @@ class WriterThread:
             if outcome is not None:
                 raise outcome
 
-    async def _open(self, stack: AsyncExitStack) -> Destination:
+    async def _open(self, stack: AsyncExitStack) -> drains.Destination:
         opening = stack.enter_async_context(self._open_destination())
         if self._local:  # a file needs no limit: waits for the locks of other processes are bounded where they wait
             return await opening
-        answers = OpeningSteps()
+        answers = drains.OpeningSteps()
         timeout_s = self._settings.connect_timeout_s
         try:
-            patience = Patience(timeout_s, progress=lambda: answers.count)
+            patience = drains.Patience(timeout_s, progress=lambda: answers.count)
             return await patience.run(answers.counted(opening), name="pycrorm open destination")
-        except PatienceEnded:
+        except drains.PatienceEnded:
             raise errors.DatabaseUnavailable(f"the database did not answer within {timeout_s:g} s") from None
