@@ -3,6 +3,7 @@
 The timelines are `event`, the sequence of the event, and `time`, since the episode's start. All changes of one frame
 are one column (`send_columns`), so that a recording is small and opens at once. `joints/ROBOT/JOINT` has the positions
 of each joint that moves, `numbers/NAME` the numbers that were observed, `actions/ROBOT` the innermost running action.
+A mesh is once in the file for each link that has it, and moves with the frame of the link.
 """
 
 from __future__ import annotations
@@ -13,13 +14,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.export import scenes
 from pycrorm_async.export.formats import Format, Written
 from pycrorm_async.query import observed_images
 from pycrorm_async.query.replay import ReplayTime
+from pycrorm_async.query.scene import Triangles
 
 _APPLICATION = "pycrorm"
+_TRIANGLES_MAX = 1_000_000
+"""Bounds the triangles of the meshes, which take about 25 MB; the others are boxes."""
 
 
 def write_rerun(
@@ -65,7 +71,10 @@ def write_rerun(
         recording.set_time("event", sequence=change.when.sequence)
         recording.set_time("time", duration=change.when.since_ns / 1e9)
         for frame, shapes in objects[change.object].shapes.items():
-            _log_shapes(rr, recording, entities[frame], shapes)
+            _log_shapes(rr, recording, entities[frame], [each for each in shapes if not each.mesh])
+            for number, shape in enumerate(each for each in shapes if each.mesh):
+                mesh = objects[change.object].meshes[shape.mesh]
+                recording.log(f"{entities[frame]}/shape_mesh_{number}", *_mesh(rr, shape, mesh))
     recording.reset_time()
     count += _send_removals(rr, recording, episode, objects, entities)
     count += _send_plan(rr, recording, episode)
@@ -104,6 +113,24 @@ def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[scenes.Sc
             case _:  # a capsule is shown as the cylinder between its ends
                 shown = rr.Cylinders3D(radii=[each[0] for each in sizes], lengths=[each[1] for each in sizes], **placed)
         recording.log(f"{entity}/shape_{kind}", shown)
+
+
+def _mesh(rr: Any, shape: scenes.SceneShape, mesh: Triangles) -> tuple[Any, Any]:
+    """Return a mesh with normals, without which the viewer draws no shades, and its place in the frame of its link."""
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(mesh.vertices)
+    for corner in range(3):
+        np.add.at(normals, mesh.faces[:, corner], across)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    drawn = rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=normals,
+        albedo_factor=shape.color,
+    )
+    placed = rr.InstancePoses3D(translations=[shape.translation], quaternions=[shape.rotation], scales=[shape.sizes])
+    return drawn, placed
 
 
 def _send_removals(
@@ -195,7 +222,7 @@ def _joints(episode: scenes.ExportedEpisode) -> Iterator[tuple[int, str, tuple[R
 
 
 RERUN = Format(
-    partial(scenes.write_scene, write_rerun),
+    partial(scenes.write_scene, write_rerun, triangles_max=_TRIANGLES_MAX),
     noun="change",
     holds="episode",
     packages=("rerun-sdk",),

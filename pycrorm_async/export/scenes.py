@@ -25,8 +25,9 @@ from pycrorm_async.query import observed_images
 from pycrorm_async.query.observed_images import Content, Kind
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay, ReplayedNode, ReplayTime
-from pycrorm_async.query.scene import assumed_model, joint_pose, link_poses, object_model, point_model
+from pycrorm_async.query.scene import Triangles, assumed_model, joint_pose, link_poses, object_model, point_model
 from pycrorm_async.query.text import parameters_text
+from pycrorm_async.report.document import Meshes
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.world.pose import Pose
@@ -603,9 +604,10 @@ class FrameChange(NamedTuple):
 
 
 class SceneShape(NamedTuple):
-    """A shape in the frame of a link: kind (box, cylinder, capsule, sphere), sizes (m), pose and colour.
+    """A shape in the frame of a link: kind (box, cylinder, capsule, sphere, mesh), sizes (m), pose and colour.
 
-    The sizes of a box are its three edges, of a cylinder and a capsule radius and length, of a sphere the radius.
+    The sizes of a box are its three edges, of a cylinder and a capsule radius and length, of a sphere the radius, of a
+    mesh the factors by which its triangles, in `SceneObject.meshes` by this reference, are scaled.
     """
 
     kind: str
@@ -613,6 +615,7 @@ class SceneShape(NamedTuple):
     translation: tuple[float, float, float]
     rotation: tuple[float, float, float, float]
     color: tuple[float, float, float, float]
+    mesh: str = ""
 
 
 class SceneObject:
@@ -622,6 +625,7 @@ class SceneObject:
         model: root link, shapes by link, and joints, as `query.scene.object_model` returns them.
         base_link: the link whose pose is recorded; None means the root link.
         color: of all its shapes; None means each shape's own.
+        meshes: the triangles of the shapes that are meshes.
 
     Attributes:
         name: of its frame.
@@ -629,8 +633,16 @@ class SceneObject:
         shapes: by frame.
     """
 
-    def __init__(self, name: str, model: Mapping[str, Any], base_link: str | None, color: Any) -> None:
+    def __init__(
+        self,
+        name: str,
+        model: Mapping[str, Any],
+        base_link: str | None,
+        color: Any,
+        meshes: Mapping[str, Triangles] = MappingProxyType({}),
+    ) -> None:
         self.name = name
+        self.meshes = meshes
         self._model = model
         self._base_link = base_link
         self._joints: dict[str, float] = {}
@@ -662,14 +674,26 @@ class SceneObject:
                 yield FrameChange(change.when, self.frame(parent), self.frame(child), *_parts(frame))
 
 
-async def scene_objects(reading: Reading, episode: ExportedEpisode) -> dict[int, SceneObject]:
-    """Return the objects of an episode by identity, with their recorded, assumed or missing shapes."""
+async def scene_objects(reading: Reading, episode: ExportedEpisode, triangles_max: int = 0) -> dict[int, SceneObject]:
+    """Return the objects of an episode by identity, with their recorded, assumed or missing shapes.
+
+    Recorded meshes have boxes in their place when there would be more than `triangles_max` triangles. Unless that is 0,
+    a line in the log says which and why.
+    """
     log = await reading.log()
     fingerprints = {each.description for each in episode.world.added.values() if each.description is not None}
+    reader = Meshes(log, triangles_max)
     models: dict[str, Mapping[str, Any]] = {}
+    meshes: dict[str, Mapping[str, Triangles]] = {}
     for name, payload in (await log.descriptions(fingerprints)).items():
         try:
-            models[name] = object_model(description_of(payload))
+            description = description_of(payload)
+            if not triangles_max:
+                models[name] = object_model(description)
+                continue
+            models[name], meshes[name] = await reader.model(description)
+            if models[name].get("boxes"):
+                _log.warning("boxes stand for %s", models[name]["boxes"])
         except ValueError as error:
             models[name] = point_model(f"its description cannot be read: {error}")
     objects: dict[int, SceneObject] = {}
@@ -682,7 +706,8 @@ async def scene_objects(reading: Reading, episode: ExportedEpisode) -> dict[int,
         name = added.name.replace("/", "_")
         name = f"{name}#{identity}" if name in names else name
         names.add(name)
-        objects[identity] = SceneObject(name, model, added.base_link, added.color)
+        triangles = meshes.get(added.description or "", {})
+        objects[identity] = SceneObject(name, model, added.base_link, added.color, triangles)
     return objects
 
 
@@ -697,7 +722,8 @@ def _shape(shape: Sequence[Any], color: Sequence[float] | None) -> SceneShape:
     kind, sizes, xyz, rpy, own = shape
     translation, rotation = _parts(origin(xyz, rpy))
     red, green, blue, opacity = color or own or _GREY
-    return SceneShape(kind, tuple(sizes), translation, rotation, (red, green, blue, opacity))
+    mesh, sizes = (sizes[0], sizes[1:]) if kind == "mesh" else ("", sizes)
+    return SceneShape(kind, tuple(sizes), translation, rotation, (red, green, blue, opacity), mesh)
 
 
 def _parts(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
@@ -723,14 +749,17 @@ _WriteScene: TypeAlias = Callable[
 ]
 
 
-async def write_scene(write: _WriteScene, job: Job, path: Path) -> Written:
-    """Write one episode to a file. Raises `CallerError` for several, and `MissingExtra`."""
+async def write_scene(write: _WriteScene, job: Job, path: Path, *, triangles_max: int = 0) -> Written:
+    """Write one episode to a file, with at most so many triangles of meshes.
+
+    Raises `CallerError` for several, and `MissingExtra`.
+    """
     if len(job.selection.episodes) != 1:
         count = len(job.selection.episodes)
         raise CallerError(f"a file of the format {job.file_format} holds one episode, got {count}: name one")
     [covered] = job.selection.episodes
     episode = await read_episode(ExportedEpisode, job.reading, covered, job.reporter("reading"))
-    objects = await scene_objects(job.reading, episode)
+    objects = await scene_objects(job.reading, episode, triangles_max)
     await read_pictures(job.reading, episode)
     report = job.reporter("writing")
     # A cancelled task waits for the end of the thread: a file that is deleted while it writes would crash the process.

@@ -575,11 +575,13 @@ async def _models(log: EventLog, page: EpisodePage, after: int) -> Mapping[str, 
     added = {identity: each for identity, each in page.world.added.items() if identity > after}
     names = {each.description for each in added.values()} - {None}
     payloads = await log.descriptions([name for name in names if name is not None])
-    meshes = Meshes(log)
+    meshes = Meshes(log, _TRIANGLES_MAX)
     models: dict[str, Any] = {"": point_model("its description is not in the log")} if added or not after else {}
     for name, payload in payloads.items():
         try:
-            models[name] = await meshes.model(description_of(payload))
+            model, triangles = await meshes.model(description_of(payload))
+            encoded = {reference: _encoded(each) for reference, each in triangles.items()}
+            models[name] = {**model, "meshes": encoded} if "boxes" in model else model
         except ValueError as error:
             models[name] = point_model(f"its description cannot be read: {error}")
     for identity, each in added.items():
@@ -600,15 +602,15 @@ _NAMED_MAX = 5
 
 
 class Meshes:
-    """The meshes of one page, up to its bound."""
+    """The meshes of one page or file, up to a number of triangles."""
 
-    def __init__(self, log: EventLog) -> None:
+    def __init__(self, log: EventLog, triangles_max: int) -> None:
         self._log = log
-        self._left = _TRIANGLES_MAX
+        self._left = triangles_max
 
-    async def model(self, description: event_types.DescriptionDeclared) -> dict[str, Any]:
-        """Return the model of a description: `meshes` has its triangles, `boxes` why others are drawn as boxes."""
-        meshes: dict[str, Any] = {}
+    async def model(self, description: event_types.DescriptionDeclared) -> tuple[dict[str, Any], dict[str, Triangles]]:
+        """Return the model of a description, and the triangles of its meshes; `boxes` says why others are boxes."""
+        meshes: dict[str, Triangles] = {}
         refused: list[str] = []
         for mesh in description.meshes:
             try:
@@ -617,11 +619,11 @@ class Meshes:
                 refused.append(f"{mesh.name} ({reason})")
             else:
                 self._left -= len(triangles.faces)
-                meshes[mesh.reference] = _encoded(triangles)
+                meshes[mesh.reference] = triangles
         model = object_model(description, drawn=frozenset(meshes))
         if not description.meshes or "assumed" in model:
-            return model
-        return {**model, "meshes": meshes, "boxes": _note(refused)}
+            return model, {}
+        return {**model, "boxes": _note(refused)}, meshes
 
     async def _triangles(self, mesh: event_types.MeshValue) -> Triangles:
         """Return the triangles of a mesh file. Raises `ValueError` with the reason why it has a box instead."""
@@ -633,7 +635,7 @@ class Meshes:
             raise ValueError("its content is not in the log")
         triangles = await asyncio.to_thread(triangles_of, mesh.name, content)
         if len(triangles.faces) > self._left:
-            raise ValueError("the page has too many triangles already")
+            raise ValueError("there are too many triangles already")
         return triangles
 
 

@@ -28,6 +28,7 @@ from pycrorm_async.query.scene import link_poses, object_model
 from pycrorm_async.world import Pose
 from pycrorm_async.world.bounding_boxes import rotation_matrix
 from tests.full_disk import files_of_at_most
+from tests.report.test_scene import record as record_meshes
 
 Frames = dict[str, tuple[str, list[float], list[float]]]
 """Each frame with its parent, translation and rotation."""
@@ -316,3 +317,40 @@ async def test_a_rerun_recording_has_what_was_observed_and_a_layout(seen: Readin
     assert len(reader.blueprints()) == 1
     verify = sys.executable, "-m", "rerun", "rrd", "verify", tmp_path / "seen.rrd"
     assert await (await asyncio.create_subprocess_exec(*verify)).wait() == 0
+
+
+async def test_a_rerun_recording_has_each_recorded_mesh_once_in_the_frame_of_its_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from rerun.chunk import RrdReader
+
+    async def shapes_of(name: str, url: str) -> dict[str, dict[str, Any]]:
+        async with Reading.open(url) as reading:
+            await export(reading, 1, tmp_path / name)
+        verify = sys.executable, "-m", "rerun", "rrd", "verify", tmp_path / name
+        assert await (await asyncio.create_subprocess_exec(*verify)).wait() == 0
+        chunks = [each for each in RrdReader(tmp_path / name).stream() if "/shape_" in each.entity_path]
+        rows: dict[str, dict[str, Any]] = {}
+        for each in chunks:
+            [row] = each.to_record_batch().to_pylist()
+            rows.setdefault(each.entity_path, {}).update(row)
+        return dict(sorted(rows.items(), key=lambda row: row[0].count("/")))
+
+    url = await record_meshes(tmp_path)
+    shapes = await shapes_of("meshes.rrd", url)
+    assert [*shapes] == [f"/world/parts{link}/shape_mesh_0" for link in ("", "/obj", "/obj/dae")]
+    for shape in shapes.values():
+        corners = np.array(shape["Mesh3D:vertex_positions"])
+        assert (corners.min(axis=0).tolist(), corners.max(axis=0).tolist()) == ([0, 0, 0], [1, 1, 1])
+        assert len(shape["Mesh3D:triangle_indices"]) == 6
+        assert np.linalg.norm(shape["Mesh3D:vertex_normals"], axis=1) == pytest.approx(1)
+        assert np.array(shape["Mesh3D:vertex_normals"])[corners[:, 2] == 1].tolist() == [pytest.approx([0, 0, 1])]
+        assert shape["InstancePoses3D:scales"] == [[0.5, 0.5, 2]]
+    monkeypatch.setitem(FORMATS, "rrd", FORMATS["rrd"]._replace(write=functools.partial(write_scene, write_rerun)))
+    boxes = await shapes_of("boxes.rrd", url)
+    assert [*boxes] == [each.replace("mesh_0", "box") for each in shapes]
+    few = functools.partial(write_scene, write_rerun, triangles_max=7)
+    monkeypatch.setitem(FORMATS, "rrd", FORMATS["rrd"]._replace(write=few))
+    mixed = [each.rpartition("/")[2] for each in await shapes_of("few.rrd", url)]
+    assert mixed == ["shape_mesh_0", "shape_box", "shape_box"]
+    assert "boxes stand for 2 mesh files: part.obj (there are too many triangles already)" in caplog.text

@@ -257,7 +257,7 @@ async def test_a_page_lists_which_meshes_are_boxes_and_why(tmp_path: Path, monke
     async with Reading.open(await record(tmp_path)) as reading:
         document = await episode_document(reading, 1)
     model = document["models"][document["objects"][0]["model"]]
-    reason = "the page has too many triangles already"
+    reason = "there are too many triangles already"
     assert model["boxes"] == f"2 mesh files: part.obj ({reason}), part.dae ({reason})"
     assert [model["shapes"][link][0][0] for link in ("stl", "obj")] == ["mesh", "box"]
     assert len(model["meshes"]) == 1
