@@ -118,7 +118,7 @@ def test_a_table_of_many_episodes_has_the_newest_and_says_how_many_it_left_out(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(overview_file, "_EPISODES_MAX", 2)
-    monkeypatch.setattr(overview_file, "_PAGES_MAX", 1)
+    monkeypatch.setattr(overview_file, "PAGES_MAX", 1)
     url = f"sqlite:///{recorded}/pycrorm.db"
 
     async def newest(choice: EpisodeChoice | None) -> tuple[list[int], int]:
