@@ -39,7 +39,8 @@ _NAMES = {
 }
 
 __all__ = [each for names in _NAMES.values() for each in names.split()]
-__getattr__ = lazy_names(__name__, _NAMES)
+if not TYPE_CHECKING:  # which would take any other name for one of this package
+    __getattr__ = lazy_names(__name__, _NAMES)
 
 
 def __dir__() -> list[str]:
