@@ -196,11 +196,10 @@ async def _add_sizes(reading: Reading, frame: pd.DataFrame) -> None:
 
 def _unknown(tries: pd.DataFrame) -> tuple[str, ...]:
     """Return what the memory does not know of these tries, each as a line with the number of tries."""
-    place = tries.get("place_from", "stood")
     counts = {
-        "the place to which the robot was sent: learned from where it stood": place == "stood",
-        "the size of the object": tries.get("width", math.nan) != tries.get("width", math.nan),
-        "the surface below the object": place != "choice",
+        "the place to which the robot was sent: learned from where it stood": tries["place_from"] == "stood",
+        "the size of the object": tries["width"].isna(),
+        "the surface below the object": tries["place_from"] != "choice",
         "joint limits, collisions and disturbance": tries["rollouts"].isna(),
     }
     return tuple(f"{what} ({count:,} of {len(tries):,})" for what, each in counts.items() if (count := int(each.sum())))

@@ -133,6 +133,8 @@ async def test_tries_have_the_place_to_which_the_robot_was_sent_also_if_it_never
     scene = Scene(collisions=True, kitchen=True, torso_height=0.3, disturbance=Disturbance(base_m=0.05))
     count = 25
     async with Memory.open(database_url) as memory:
+        await memory.flush()
+        assert (await read_tries(memory.reading)).empty
         with scene.entered() as stage:
             tries = MoveAndPickUp(stage.target)
             tally = await batch_rollout(
