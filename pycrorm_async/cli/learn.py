@@ -204,6 +204,11 @@ def learn(
     model = model or Learned.PLACES
     if explore is not None and model is not Learned.SUCCESS:
         raise CallerError(f"--explore {explore} needs --model success: other policies try as they act")
+    if any(base_noise) and model is Learned.PLACES:
+        raise CallerError(
+            "--base-noise needs --model polar or success: a tree of places is learned from where the robot stood, and"
+            " asked where to send it"
+        )
     if study_rollouts and model is not Learned.PLACES:
         raise CallerError(f"--study needs --model places, got --model {model}")
     (base_m, base_deg), (object_m, object_deg) = base_noise, object_noise

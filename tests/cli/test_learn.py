@@ -204,7 +204,8 @@ def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) ->
         (("--explore", "random"), 2, "--explore random needs --model success"),
         (("--model", "polar", "--study", "5"), 2, "--study needs --model places, got --model polar"),
         (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
-        (("--base-noise", "-1", "0"), 2, "base_m of a disturbance must be finite and >= 0, got -1.0"),
+        (("--base-noise", "1", "0"), 2, "--base-noise needs --model polar or success"),
+        (("--object-noise", "-1", "0"), 2, "object_m of a disturbance must be finite and >= 0, got -1.0"),
         (("--rollouts", "9", "--min-samples-leaf", "10"), 2, "choose a larger --rollouts (rollouts=) or a smaller"),
         # learning/test_experiment shows this one of the function
         pytest.param(("--rollouts", "30"), 2, "successes are too few to learn from", marks=pytest.mark.soak),
