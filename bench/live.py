@@ -6,14 +6,17 @@
 This process records moves of a robot and nodes at a fixed rate with the default writer, `pycrorm watch` serves the
 episode, and a third process reads its stream and polls the log. The lag of an event is the time from its own clock
 until it is in the log, and until the first part that includes it arrives. Where Chromium is installed, a second run
-shows the page as well, drawn without a graphics processor, and also measures the lag to the end of its drawing. The
-script prints one JSON line: lags in ms, and the share of one core that the server takes.
+shows the page as well, drawn without a graphics processor, and also measures the lag to the end of its drawing. In a
+third run, at 200 events a second, two cameras observe JPEG images of 640 x 480 pixels five times a second, and the lag
+of an image ends when the browser has decoded it. The script prints one JSON line: lags in ms, and the share of one core
+that the server takes.
 """
 
 from __future__ import annotations
 
 import argparse
 import http.client
+import io
 import json
 import os
 import sqlite3
@@ -29,8 +32,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
+from PIL import Image
+
 from bench.reporting.figures import console, cpu_s_of, percentiles
 from pycrorm_async import Memory
+from pycrorm_async.record.camera import CameraStream
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.world import Pose
 from tests.databases import ask
@@ -40,22 +47,46 @@ _RATES = (100, 1_000)
 _POLL_S = 0.002
 _REST_S = 2.0
 """Ends each run, so that the last part arrives."""
+_IMAGES_RATE, _IMAGES_HZ, _CAMERAS = 200, 5, ("head", "wrist")
 _NOTE_DRAWN = """
 globalThis.drawn = [];
+globalThis.seen = [];
 const extend = pycrormPage.extend.bind(pycrormPage);
 pycrormPage.extend = (...parts) => {
   extend(...parts);
-  requestAnimationFrame(() => setTimeout(() => drawn.push([Date.now() * 1e6, parts.at(-1).episode.last])));
+  requestAnimationFrame(() => setTimeout(async () => {
+    drawn.push([Date.now() * 1e6, parts.at(-1).episode.last]);
+    const newest = Math.max(0, ...[...pycrormPage.episode.cameras.values()].map((pictures) => pictures.at(-1).at));
+    const loading = [...document.images].filter((each) => !each.complete);
+    await Promise.all(loading.map((each) => each.decode().catch(() => 0)));
+    seen.push([Date.now() * 1e6, newest]);
+  }));
 };
 """
 
 
-def record(episode: RecordedEpisode, drive: Any, rate: int, seconds: float) -> int:
+def images() -> list[bytes]:
+    """Return JPEG files of 640 x 480 pixels, about 50 kB each, as a camera has them."""
+    noise = np.random.default_rng(0).integers(0, 40, (480, 680, 3), np.uint8)
+    shades = np.linspace(0, 200, 640, dtype=np.uint8)[:, None]
+    files = []
+    for shift in range(0, 40, 4):
+        file = io.BytesIO()
+        Image.fromarray(noise[:, shift : shift + 640] + shades).save(file, "JPEG", quality=80)
+        files.append(file.getvalue())
+    return files
+
+
+def record(episode: RecordedEpisode, drive: Any, rate: int, seconds: float, cameras: Sequence[CameraStream]) -> int:
     """Record moves, and every twentieth event a node, at one rate; return the rate that was reached."""
+    seen = images()
     count, began_s = round(rate * seconds / 20) * 20, time.perf_counter()
     for number in range(count):
         if (ahead_s := began_s + number / rate - time.perf_counter()) > 0:
             time.sleep(ahead_s)
+        if number % (rate // _IMAGES_HZ) == 0:
+            for camera in cameras:
+                camera.put(seen[number // (rate // _IMAGES_HZ) % len(seen)])
         if number % 20 == 0:
             episode.start(number, drive, {"target": Pose([1, 2, 0])}, robot="base")
         elif number % 20 == 19:
@@ -129,10 +160,11 @@ def lags_ms(arrivals: Sequence[Sequence[int]], events: Sequence[Sequence[int]]) 
     return percentiles([(arrivals[at][0] - wall_ns) / 1e6 for at, wall_ns in indices if at < len(arrivals)])
 
 
-def measure(rate: int, seconds: float, folder: Path, *, draws: bool) -> dict[str, Any]:
+def measure(rate: int, seconds: float, folder: Path, *, draws: bool, cameras: Sequence[str] = ()) -> dict[str, Any]:
     url = f"sqlite:///{folder / 'pycrorm.db'}"
     result: dict[str, Any] = {}
     drawn: list[list[int]] = []
+    shown: list[list[int]] = []
     with ExitStack() as stack:
         address, process = stack.enter_context(served(folder))
         memory = stack.enter_context(Memory.sync(url))
@@ -147,16 +179,20 @@ def measure(rate: int, seconds: float, folder: Path, *, draws: bool) -> dict[str
                 tab.ask(_NOTE_DRAWN)
             reader = start_reader(address, seconds + 2 * _REST_S, folder)
             before_s = cpu_s_of(process)
-            result["events_per_s"] = record(episode, drive, rate, seconds)
+            streams = [stack.enter_context(episode.observe_camera(each, hz=2 * _IMAGES_HZ)) for each in cameras]
+            result["events_per_s"] = record(episode, drive, rate, seconds, streams)
             time.sleep(_REST_S)
             result["server_cpu_share"] = round((cpu_s_of(process) - before_s) / (seconds + _REST_S), 3)
-            drawn = tab.ask("drawn") if tab is not None else []
+            drawn, shown = (tab.ask("drawn"), tab.ask("seen")) if tab is not None else ([], [])
         memory.flush()
         events = ask(url, "SELECT sequence, wall_ns FROM event WHERE episode = 1 AND sequence > 3 ORDER BY sequence")
         arrivals, stored = json.loads(reader.communicate()[0])
         result["stored_ms"], result["stream_ms"] = lags_ms(stored, events), lags_ms(arrivals, events)
         if drawn:
             result["drawn_ms"] = lags_ms(drawn, events)
+        if cameras:
+            observed = ask(url, "SELECT sequence, wall_ns FROM event WHERE type = 'Observed' ORDER BY sequence")
+            result |= {"images": len(observed), "image_ms": lags_ms(shown, observed)}
     return result
 
 
@@ -178,6 +214,10 @@ def main() -> None:
             console().print(f"{name}, {rate:,} events/s …")
             with tempfile.TemporaryDirectory(prefix="b") as folder:
                 result.setdefault(name, {})[str(rate)] = measure(rate, seconds, Path(folder), draws=draws)
+    if chromium() is not None:
+        console().print(f"images, {_IMAGES_RATE:,} events/s …")
+        with tempfile.TemporaryDirectory(prefix="b") as folder:
+            result["images"] = measure(_IMAGES_RATE, seconds, Path(folder), draws=True, cameras=_CAMERAS)
     print(json.dumps(result))
 
 
