@@ -108,8 +108,10 @@ def test_chosen_curves_lie_over_one_another_on_the_axis_of_the_chart(chrome: Bro
         mouse(tab, "mouseWheel", ".overlay", 400, 40, deltaX=-90, deltaY=0)
         tab.wait_for(f"{WINDOW}[0] < {low}")
         assert tab.ask(f"{WINDOW}[1] - {WINDOW}[0]") == pytest.approx(high - low)
-        tab.ask("document.querySelector('.legend button').click()")
+        tab.ask("document.querySelector('.legend button').focus()")
+        tab.press(" ")
         assert_on_axis(tab, 2)
+        assert tab.ask("[document.activeElement.className, pycrormPage.playback.running]") == ["legend", False]
         tab.wait_for("location.hash.split('c=').length === 3")
         address, legend_now = tab.ask("location.hash"), tab.ask(legend)
         assert tab.problems() == []

@@ -15,7 +15,7 @@ export class CurvesView {
   /** `gantt` has the axis; `onChoose` is called when other curves are chosen. */
   constructor(holder, episode, gantt, onChoose) {
     Object.assign(this, { holder, episode, gantt, onChoose, chosen: new Map(), alone: false });
-    this.legend = element("div", { class: "legend" });
+    this.legend = element("div", { class: "legend", tabindex: -1 }); // it gets the focus of a button that is gone
     const keys = "W and S zoom, A and D move, 0 shows all";
     this.overlay = element("div", { class: "overlay", role: "application", tabindex: 0, "aria-label": `Curves on the axis of the chart: ${keys}` });
     gantt.steer(this.overlay);
