@@ -78,6 +78,7 @@ RUNS = (
     Run("rebuild postgresql, large", (*_POSTGRESQL, *_LARGE), quick=False),
     Run("growth", ("--turns", "2")),
     Run("placement"),
+    Run("lake"),
     Run("thesis, 488,043 nodes", _WHOLE, quick=False),
     Run("thesis postgresql, 488,043 nodes", (*_POSTGRESQL, *_WHOLE), quick=False),
 )

@@ -13,8 +13,8 @@ import typer
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.output import Form, LakeOption, parse_since, print_rows, problem
 from pycrorm_async.cli.reading import Place
-from pycrorm_async.errors import CallerError
-from pycrorm_async.operations.archive import archive_episodes
+from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.lake import shown
 
@@ -36,13 +36,24 @@ def archive(
         raise CallerError("name the lake with --to ducklake:FOLDER")
     collect_seldom()
     reason, before_this = f"archive --before {before}", parse_since(before)
+    summary, fault = ArchiveSummary([], {}), None
     with progress_bar("archiving") as report:
-        archiving = archive_episodes(place.url, lake, before=before_this, reason=reason, report_progress=report)
-        summary = asyncio.run(archiving)
+        try:
+            asyncio.run(
+                archive_episodes(
+                    place.url, lake, before=before_this, reason=reason, summary=summary, report_progress=report
+                )
+            )
+        except PycrormError as error:
+            if not summary.removed:
+                raise
+            fault = error
     rows = [(each.number, each.id, each.head, each.digest) for each in summary.removed]
     document = {"archived": [each._asdict() for each in summary.removed], "stayed": summary.stayed}
     print_rows(form, document, f"Archived in {shown(lake)}", ("episode", "id", "events", "digest"), rows)
     for name, why in summary.stayed.items():
         problem(f"episode {name} stays: {why}")
+    if fault is not None:
+        raise fault
     place.note_pending_events()
     return 4 if summary.stayed else 0

@@ -17,6 +17,7 @@ from pycrorm_async.cli.reading import Place
 from pycrorm_async.clock import utc_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations import removal
+from pycrorm_async.operations.retention import BY_RULE
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
 
@@ -32,7 +33,7 @@ def erase(
     ] = None,
     keep: Annotated[
         str | None,
-        typer.Option(metavar="AGE", help="Instead of EPISODE: all that ended before then: 90d, 52w, or a date."),
+        typer.Option(metavar="AGE", help="Instead of EPISODE: all that are older: 90d, 52w, or ended before a date."),
     ] = None,
     tag: output.TagOption = None,
     reason: Annotated[str | None, typer.Option(metavar="TEXT", help="The reason, which stays in the journal.")] = None,
@@ -48,6 +49,9 @@ def erase(
     copy or an import, is discarded. An episode that is or was archived is erased from its lake too. Not rewritten are
     backups, replicas, and on PostgreSQL the write-ahead log and the free space in pages. Run it again after an
     interruption, or when it has named what is left (exit code 1). On PostgreSQL it needs the login that owns the log.
+
+    For --keep, an age counts from the end of an episode, and at the earliest from when episodes started that were
+    stored before it, because a robot's clock may be years behind.
     """
     if not episodes and keep is None:
         return asyncio.run(_print_journal(place, form))
@@ -55,6 +59,8 @@ def erase(
         raise CallerError("name episodes or give --keep, not both")
     if tag and keep is None:
         raise CallerError("--tag belongs to --keep: it chooses among the episodes that ended before then")
+    if reason is not None and reason.startswith(BY_RULE):
+        raise CallerError(f"a reason that begins with {BY_RULE!r} is that of a rule: put another word before it")
     why = reason or (f"--keep {keep}" + "".join(f" --tag {each}" for each in tag or ()) if keep else "")
     if not why:
         raise CallerError("say why with --reason: it stays in the journal when the episode is gone")

@@ -51,8 +51,10 @@ def add(
 ) -> None:
     """Add a rule, or replace the one with the same tags. It changes nothing until `pycrorm retention apply`.
 
-    The age counts from the end of an episode. Of several rules that concern an episode, the one with most tags decides,
-    and of these the one that keeps longer; what no rule concerns stays. The password of a lake's catalog is not stored.
+    The age counts from the end of an episode, and at the earliest from when episodes started that were stored before
+    it, because a robot's clock may be years behind. Of several rules that concern an episode, the one with most tags
+    decides, and of these the one that keeps longer; what no rule concerns stays. The password of a lake's catalog is
+    not stored.
     """
     try:
         age = None if keep == FOREVER else output.parse_age(keep)
@@ -123,6 +125,10 @@ async def _apply(place: Place, form: output.Form, *, dry_run: bool, yes: bool) -
     _print_due(form, f"Removed from {place.address}", due, outcomes)
     for name, why in refused.items():
         output.problem(f"episode {name} stays: {why}")
+    for fault in result.faults[1:]:
+        output.problem(str(fault))
+    for fault in result.faults[:1]:  # its exit code counts
+        raise fault
     return name_what_is_left(result.erased) or (4 if refused else 0)
 
 

@@ -10,12 +10,11 @@ the commit leaves files that the catalog does not know; an hour later the next a
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from datetime import UTC, datetime
-from itertools import groupby
-from operator import attrgetter
+from datetime import datetime
+from itertools import islice
 from typing import Final, NamedTuple
 
-from pycrorm_async.errors import DamageError, DatabaseError
+from pycrorm_async.errors import DamageError
 from pycrorm_async.events.types import BlobReference, references_in
 from pycrorm_async.operations.copy import declared_by
 from pycrorm_async.operations.removal import EVENTS_AT_ONCE, parts, remove
@@ -23,12 +22,16 @@ from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.projections.rebuild import claimed
 from pycrorm_async.store.address import shared_address
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.lake import ATTEMPTS, Lake, LakeEpisode, check_present, digest_after, shown
+from pycrorm_async.store.lake import Lake, LakeEpisode, check_present, digest_after, shown
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode, RunningDigest, Span, StoredEvent
+from pycrorm_async.writer.drain import Backoff, retry
 
 _EVENTS_AT_ONCE: Final = 200_000
 """Bounds the events of one file of the lake, unless an episode has more, and with them the memory that is used."""
+
+_COMMITTING: Final = Backoff(first_s=0.1, longest_s=5.0, attempts_max=12)
+"""The backoff of commits to a lake to which other processes commit: a catalog in a file refuses one of two at once."""
 
 
 class ArchiveSummary(NamedTuple):
@@ -45,18 +48,19 @@ async def archive_episodes(
     before: datetime,
     only: Collection[int] | None = None,
     reason: str,
+    summary: ArchiveSummary | None = None,
     report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
 ) -> ArchiveSummary:
     """Move the episodes that ended before this time into the lake at this address, which is made if it is missing.
 
-    With `only`, those among them with one of these numbers.
+    With `only`, those among them with one of these numbers. Adds to `summary`, which has what went before an error.
 
     Leaves out episodes that are stopped or not visible yet. Raises `CallerError` while another archive or rebuild of
     the memory runs, `MissingExtra`, and errors of both databases, also for a lake that has episodes of this memory and
     is missing; what was moved until then stays moved.
     """
     log = await EventLog.open_to_change(shared_address(url))
-    summary = ArchiveSummary([], {})
+    summary = ArchiveSummary([], {}) if summary is None else summary
     try:
         async with claimed(log):
             if any(each.archived_in == shown(address) for each in await log.all_removed()):
@@ -87,6 +91,21 @@ def _may_go(row: EpisodeRow, end_ns: float) -> bool:
 
 
 async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason: str, summary: ArchiveSummary) -> None:
+    added = await _add_missing(log, lake, rows, summary)
+    read = lake.digests([each.id for each in added])
+    for each in added:
+        if read.get(each.id) != each.digest:
+            summary.stayed[each.id] = "the lake holds other events of it than this memory"
+    moved = [each for each in rows if each.id not in summary.stayed]
+    digests = {row.number: read[row.id] for row in moved}
+    for some in parts(moved, EVENTS_AT_ONCE):
+        summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=digests))
+
+
+async def _add_missing(
+    log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], summary: ArchiveSummary
+) -> list[LakeEpisode]:
+    """Add the events that the lake lacks; return the episodes that it should have now, to be read back."""
     there, erased = lake.episode_rows([each.id for each in rows]), lake.erased([each.id for each in rows])
     kept = await log.last_digests(rows[0].number, rows[-1].number)
     new: list[tuple[LakeEpisode, Sequence[StoredEvent]]] = []
@@ -97,8 +116,8 @@ async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason
             summary.stayed[row.id] = f"it was restored from {elsewhere[row.id]}, which has it still: archive it there"
             continue
         if row.id in erased:
-            when = f"{datetime.fromtimestamp(erased[row.id] / 1e9, UTC):%Y-%m-%d}"
-            summary.stayed[row.id] = f"it was erased from the lake on {when}: `pycrorm erase` removes it here too"
+            why = erased[row.id]
+            summary.stayed[row.id] = f"it was erased from the lake on {why}: `pycrorm erase` removes it here too"
             continue
         try:
             events = read_events.get(row.number, [])
@@ -122,23 +141,19 @@ async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason
     lacking = [each for each in new if each[0].id not in there or there[each[0].id] != each[0]]
     if lacking:
         await _add(log, lake, lacking)
-    read = lake.digests([each.id for each, _ in new])
-    for each, _ in new:
-        if read.get(each.id) != each.digest:
-            summary.stayed[each.id] = "the lake holds other events of it than this memory"
-    moved = [each for each in rows if each.id not in summary.stayed]
-    digests = {row.number: read[row.id] for row in moved}
-    for some in parts(moved, EVENTS_AT_ONCE):
-        summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=digests))
+    return [each for each, _ in new]
 
 
 async def _events(log: EventLog, rows: Sequence[EpisodeRow]) -> dict[int, list[StoredEvent]]:
-    """Read the events of episodes, by number; none if one of them is damaged."""
+    """Read the events of episodes, by number; none if one of them is damaged or lacks an event."""
     try:
         events = await log.spans([Span(row.number, 0, row.head) for row in rows])
     except DamageError:
         return {}
-    return {number: [*some] for number, some in groupby(events, key=attrgetter("number"))}
+    if len(events) < sum(row.head for row in rows):
+        return {}
+    in_order = iter(events)
+    return {row.number: [*islice(in_order, row.head)] for row in rows}
 
 
 async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]]) -> None:
@@ -148,21 +163,16 @@ async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, 
     if lacking - declarations.keys():
         declarations |= {name: each for name, each in (await log.named_declarations()).items() if name in lacking}
     references: dict[str, BlobReference] = {}
-    for kind, payload in [
-        *((each.type, each.payload) for each in events),
-        *(("DescriptionDeclared", each) for each in declarations.values()),
-    ]:
-        if b'"$blob"' in payload:
-            references |= {each.hash: each for each in references_in(kind, payload)}
+    referring = [(each.type, each.payload) for each in events if b'"$blob"' in each.payload]
+    for kind, payload in [*referring, *(("DescriptionDeclared", each) for each in declarations.values())]:
+        references |= {each.hash: each for each in references_in(kind, payload)}
     blobs: dict[str, tuple[str, bytes]] = {}
     for name in lake.absent("blob", "hash", references):
         content = await log.blobs.read_blob(name)
         if content is not None:
             blobs[name] = references[name].media_type, content
-    for attempt in range(ATTEMPTS):
-        try:
-            return lake.add(episodes, declarations, blobs, log.log_id)
-        except DatabaseError:
-            if attempt == ATTEMPTS - 1:
-                raise
-    return None
+
+    async def add() -> None:
+        lake.add(episodes, declarations, blobs, log.log_id)
+
+    await retry(add, backoff=_COMMITTING)

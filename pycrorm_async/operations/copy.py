@@ -9,7 +9,7 @@ and row ids belong to a database, so the target assigns its own.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -19,8 +19,16 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
+from pycrorm_async.bulk_records import make
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import CallerError, DamageError, DatabaseError, DatabaseUnavailable, LogDamaged
+from pycrorm_async.errors import (
+    CallerError,
+    DamageError,
+    DatabaseError,
+    DatabaseUnavailable,
+    LogDamaged,
+    UnknownEpisode,
+)
 from pycrorm_async.events.codec import Record, declaration_type, decode, encode, fingerprint
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
@@ -97,7 +105,10 @@ async def copy_episodes(
     else:
         log = await EventLog.open(shared_address(source), create=False)
     try:
-        named = [log.named(each) if isinstance(log, Lake) else await episode_named(log, each) for each in episodes]
+        named = [
+            await (_archived(log, each, target_address) if isinstance(log, Lake) else episode_named(log, each))
+            for each in episodes
+        ]
         chosen = {row.id: row for row in named}
         rows = list(chosen.values()) if episodes else await log.episodes()
         async with _open_target(target_address, log) as (target_log, destination):
@@ -106,6 +117,19 @@ async def copy_episodes(
     finally:
         await log.close()
     return CopySummary(str(log.address), target_address.to_type, done)
+
+
+async def _archived(lake: Lake, name: str, target: DatabaseAddress) -> EpisodeRow:
+    """Find an episode of a lake. Raises `UnknownEpisode`, of one that the target has erased with time and reason."""
+    try:
+        return lake.named(name)
+    except UnknownEpisode:
+        with suppress(DatabaseError):  # there may be no target yet
+            async with await EventLog.open(target, create=False) as log:
+                for each in await log.all_removed():
+                    if each.archived_in is None and each.id.startswith(name.lower()):
+                        raise UnknownEpisode(str(each)) from None
+        raise
 
 
 @asynccontextmanager
@@ -218,10 +242,12 @@ class _Copier:
         shared = min(row.head, head)
         if shared:
             await self._compare(row._replace(head=shared))
+        is_intact = isinstance(self._source, Lake) and self._source.is_intact(row)
         async for page in self._source.pages(row, after=shared):
             events = self._batch.setdefault(row.identity, [])
             for event in page:
-                _refuse_unreadable(row.id, event)
+                if not is_intact:
+                    _refuse_unreadable(row.id, event)
                 events.append(event)
                 self._batch_bytes += len(event.payload)
             self._batch_events += len(page)
@@ -266,7 +292,9 @@ class _Copier:
     async def _append(self) -> None:
         batch, self._batch, self._batch_events, self._batch_bytes = self._batch, {}, 0, 0
         declarations = await self._declarations(batch.values())
-        records = {episode: [Record(0, episode, *each[1:]) for each in events] for episode, events in batch.items()}
+        records = {
+            episode: [make(Record, (0, episode, *each[1:])) for each in events] for episode, events in batch.items()
+        }
         try:
             await self._append_at_once([*declarations, *chain.from_iterable(records.values())])
         except DamageError:
@@ -318,21 +346,22 @@ class _CopiedType(msgspec.Struct):
 
 
 _DECLARED_BY = {"NodeStarted": attrgetter("designator"), "ObjectAdded": attrgetter("description")}
+_decode_declared = msgspec.json.Decoder(_CopiedType).decode
 
 
 def declared_by(events: Iterable[StoredEvent]) -> set[str]:
-    """Return the fingerprints of the types and descriptions that these events name."""
-    named = (_declaration(each) for each in events if each.type in _DECLARED_BY)
+    """Return the fingerprints of the types and descriptions that these events name.
+
+    Leaves out one that another version stores elsewhere; the fold parks its node.
+    """
+    named: set[str | None] = set()
+    for event in events:
+        if (name := _DECLARED_BY.get(event.type)) is not None:
+            try:
+                named.add(name(_decode_declared(event.payload)))
+            except msgspec.ValidationError:
+                continue
     return {each for each in named if each is not None}
-
-
-def _declaration(event: StoredEvent) -> str | None:
-    """Return the declaration's fingerprint; None where another version stores it, whose node the fold parks."""
-    try:
-        fingerprint_: str | None = _DECLARED_BY[event.type](msgspec.json.decode(event.payload, type=_CopiedType))
-    except msgspec.ValidationError:
-        return None
-    return fingerprint_
 
 
 # === tag ======================================================================================================

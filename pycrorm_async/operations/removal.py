@@ -41,7 +41,7 @@ from pycrorm_async.store.lake import erase_in_lake
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
 
-EVENTS_AT_ONCE: Final = 10_000
+EVENTS_AT_ONCE: Final = 50_000
 """Bounds the events that one transaction deletes, unless one episode has more, and so the wait of other writers."""
 _ROW_KEYS: Final = ("id", "resolution_id", "node_id")
 """Possible names of the column with row ids, which begins a table's key; the first that the table has counts."""
@@ -61,7 +61,7 @@ class ErasedEpisode(NamedTuple):
 async def erasable(
     log: EventLog, names: Sequence[str], *, ended_before: datetime | None = None, tags: Collection[str] = ()
 ) -> list[EpisodeRow | RemovedEpisode]:
-    """Return the named episodes; with `ended_before`, instead those that ended before it and have all these tags.
+    """Return the named episodes; with `ended_before`, those older than it (`ages_from`) that have all these tags.
 
     A name may be that of an erased or archived episode. Raises `CallerError` for one that runs, and `UnknownEpisode`.
     """
@@ -72,8 +72,27 @@ async def erasable(
             _refuse_running(row)
         return list({row.number: row for row in rows.values()}.values())
     end_ns = ended_before.timestamp() * 1e9
-    old = [each for each in await log.episodes() if each.ended_wall_ns is not None and each.ended_wall_ns < end_ns]
+    old = [row for row, from_ns in ages_from(await log.episodes(), SYSTEM_CLOCK.wall_ns()) if from_ns < end_ns]
     return [each for each in old if not tags or {*tags} <= {*await tags_of(log, each)}]
+
+
+def ages_from(rows: Sequence[EpisodeRow], now_ns: int) -> Iterator[tuple[EpisodeRow, int]]:
+    """Yield each episode that has ended, of those of a memory by number, with the time from which its age counts.
+
+    This is its end, as the clock of its recorder had it, and at the earliest the start of each episode that the memory
+    stored before it: a robot whose clock was years behind when it recorded does not lose what it just stored. Starts
+    that are still to come, of a clock that was ahead, do not count.
+
+    >>> rows = [EpisodeRow(1, "", 2, 2, 900, 950), EpisodeRow(2, "", 2, 2, 0, 50), EpisodeRow(3, "", 2, 2, 5000, 5050)]
+    >>> [from_ns for _, from_ns in ages_from(rows, 1000)]
+    [950, 900, 5050]
+    """
+    stored_ns = 0
+    for row in rows:
+        if row.ended_wall_ns is not None:
+            yield row, max(row.ended_wall_ns, stored_ns)
+        if row.started_wall_ns <= now_ns:
+            stored_ns = max(stored_ns, row.started_wall_ns)
 
 
 def _refuse_running(row: EpisodeRow | RemovedEpisode) -> None:
@@ -103,7 +122,7 @@ async def erase(
     held_in: dict[str | None, str] = {}
     for address, ids in lakes.items():
         again = f"of an archive that runs or was killed: run `pycrorm erase` in an hour, with --lake {address}"
-        if files := erase_in_lake(address, ids):
+        if files := erase_in_lake(address, ids, reason):
             left += [f"{each}, {again}" for each in files]
             held_in[address] = address
     if archived:

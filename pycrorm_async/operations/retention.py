@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -20,20 +21,20 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import ColumnClause, column, select, table
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, PycrormError
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
-from pycrorm_async.operations.removal import ErasedEpisode, erase
+from pycrorm_async.operations.removal import ErasedEpisode, ages_from, erase
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.projections.columns import EPISODE, physical_name
 from pycrorm_async.projections.generations import PROJECTION_VERSION, SHOWN, read_generation
 from pycrorm_async.store import schema
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, tags_of
-from pycrorm_async.store.stored import EpisodeRow
+from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode
 
-_VERB: Final = "retention"
-"""Begins the reason in the journal of what a rule removed."""
+BY_RULE: Final = "retention --keep "
+"""Begins the reason in the journal of what a rule removed, and no reason that a user gives."""
 
 
 class RetentionRule(NamedTuple):
@@ -42,7 +43,7 @@ class RetentionRule(NamedTuple):
     Attributes:
         number: names it; assigned by `add_rule`.
         keep: the age as the user wrote it, such as 90d, or "forever".
-        keep_s: the age in s, counted from the end of an episode; None for ever.
+        keep_s: the age in s, which `removal.ages_from` counts; None for ever.
         tags: all of these; none concerns every episode.
         archive_to: the address of the lake to which the episodes go; None erases them.
     """
@@ -55,7 +56,7 @@ class RetentionRule(NamedTuple):
 
     def __str__(self) -> str:
         tags = "".join(f" --tag {each}" for each in self.tags)
-        return f"{_VERB} --keep {self.keep}{tags}" + (f" --archive-to {self.archive_to}" if self.archive_to else "")
+        return f"{BY_RULE}{self.keep}{tags}" + (f" --archive-to {self.archive_to}" if self.archive_to else "")
 
 
 class DueEpisode(NamedTuple):
@@ -67,10 +68,11 @@ class DueEpisode(NamedTuple):
 
 
 class RetentionResult(NamedTuple):
-    """The episodes that were erased, and the summaries of the archives by lake."""
+    """The episodes that were erased, the summaries of the archives by lake, and the faults that ended some early."""
 
     erased: list[ErasedEpisode]
     archived: dict[str, ArchiveSummary]
+    faults: list[PycrormError]
 
 
 def deciding_rule(rules: Collection[RetentionRule], tags: Collection[str]) -> RetentionRule | None:
@@ -143,22 +145,20 @@ async def due_episodes(log: EventLog, rules: Sequence[RetentionRule], now_ns: in
     """
     tags_by_number = await _tags_in_tables(log, {tag for each in rules for tag in each.tags})
     due: list[DueEpisode] = []
-    for row in await log.episodes():
-        if tags_by_number is None or _rule_that_ended(rules, tags_by_number.get(row.number, ()), row, now_ns):
+    for row, from_ns in ages_from(await log.episodes(), now_ns):
+        age_ns = now_ns - from_ns
+        if tags_by_number is None or _rule_that_ended(rules, tags_by_number.get(row.number, ()), age_ns):
             tags = await tags_of(log, row)
-            rule = _rule_that_ended(rules, tags, row, now_ns)
+            rule = _rule_that_ended(rules, tags, age_ns)
             if rule is not None:
                 due.append(DueEpisode(row, tags, rule))
     return due
 
 
-def _rule_that_ended(
-    rules: Sequence[RetentionRule], tags: Collection[str], row: EpisodeRow, now_ns: int
-) -> RetentionRule | None:
-    """Return the rule that decides about an episode, if it no longer keeps it."""
-    if row.ended_wall_ns is None or (rule := deciding_rule(rules, tags)) is None or rule.keep_s is None:
-        return None
-    return rule if row.ended_wall_ns < now_ns - rule.keep_s * 10**9 else None
+def _rule_that_ended(rules: Sequence[RetentionRule], tags: Collection[str], age_ns: int) -> RetentionRule | None:
+    """Return the rule that decides about an episode of this age, if it no longer keeps it."""
+    rule = deciding_rule(rules, tags)
+    return rule if rule is not None and rule.keep_s is not None and age_ns > rule.keep_s * 10**9 else None
 
 
 async def _tags_in_tables(log: EventLog, names: Collection[str]) -> Mapping[int, Collection[str]] | None:
@@ -192,31 +192,40 @@ async def apply_rules(
 ) -> RetentionResult:
     """Erase or archive those of the confirmed episodes, by number, that are due still; finish earlier erasures.
 
-    Raises the errors of `erase` and `archive_episodes`; what was removed until then stays removed.
+    A fault, such as a lake that is away, ends what concerns this rule, and the others are applied.
     """
     due = [each for each in await due_episodes(log, await read_rules(log), now_ns) if each.row.number in confirmed]
-    by_rule: dict[RetentionRule, list[EpisodeRow]] = {}
+    by_rule: dict[RetentionRule, list[EpisodeRow | RemovedEpisode]] = {}
     for each in due:
         by_rule.setdefault(each.rule, []).append(each.row)
-    result = RetentionResult([], {})
-    parts = [
-        each for each in await log.all_removed() if each.finished_wall_ns is None and each.reason.startswith(_VERB)
-    ]
-    if parts:
-        result.erased.extend(await erase(log, parts, reason=_VERB, spool=spool))
-    for rule, rows in sorted(by_rule.items(), key=lambda each: each[0].archive_to is not None):  # a lake may be away
-        if rule.archive_to is None:
-            result.erased.extend(await erase(log, rows, reason=str(rule), spool=spool))
-            continue
-        moved = await archive_episodes(
-            url,
-            rule.archive_to,
-            before=datetime.fromtimestamp(now_ns / 1e9, UTC),
-            only={each.number for each in rows},
-            reason=str(rule),
-            report_progress=report_progress,
-        )
-        earlier = result.archived.setdefault(rule.archive_to, ArchiveSummary([], {}))
-        earlier.removed.extend(moved.removed)
-        earlier.stayed.update(moved.stayed)
+    result = RetentionResult([], {}, [])
+    begun: dict[str, list[EpisodeRow | RemovedEpisode]] = {}
+    for removed in await log.all_removed():
+        if removed.finished_wall_ns is None and removed.reason.startswith(BY_RULE):
+            begun.setdefault(removed.reason, []).append(removed)
+    erasures = [*begun.items(), *((str(rule), rows) for rule, rows in by_rule.items() if rule.archive_to is None)]
+    for reason, rows in erasures:
+        with _noting(result):
+            result.erased.extend(await erase(log, rows, reason=reason, spool=spool))
+    for rule, rows in by_rule.items():
+        if rule.archive_to is not None:
+            with _noting(result):
+                await archive_episodes(
+                    url,
+                    rule.archive_to,
+                    before=datetime.fromtimestamp(now_ns / 1e9, UTC),
+                    only={each.number for each in rows},
+                    reason=str(rule),
+                    summary=result.archived.setdefault(rule.archive_to, ArchiveSummary([], {})),
+                    report_progress=report_progress,
+                )
     return result
+
+
+@contextmanager
+def _noting(result: RetentionResult) -> Iterator[None]:
+    """Note a fault in the result instead of raising it."""
+    try:
+        yield
+    except PycrormError as fault:
+        result.faults.append(fault)

@@ -5,8 +5,8 @@
 
 Several memories share one lake: an episode has its UUID as the key, an event the UUID and its sequence. Any DuckDB
 reads the tables `episode`, `event`, `declaration` and `blob`; `erased` has the ids of episodes that the lake takes from
-no memory any more. The catalog keeps the least and the greatest value of a column, of texts too, so those of payloads
-are cleared: otherwise they would outlive an erased episode.
+no memory any more, with times and reasons. The catalog keeps the least and the greatest value of a column, of texts
+too, so those of payloads are cleared: otherwise they would outlive an erased episode.
 """
 
 # ruff: noqa: S608 - the SQL is composed of names and of paths that the caller gave
@@ -21,6 +21,7 @@ from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from hashlib import sha256
 from importlib import import_module
+from itertools import chain, groupby, islice, repeat
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -38,7 +39,7 @@ from pycrorm_async.events.ids import SEQUENCE_MAX
 from pycrorm_async.events.types import references_in
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.placement import PLAIN, Placement
-from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent
+from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent, when_and_why
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -51,17 +52,17 @@ _TABLES: Final = {
     " payload VARCHAR",
     "declaration": "fingerprint VARCHAR, payload VARCHAR",
     "blob": "hash VARCHAR, media_type VARCHAR, content BLOB",
-    "erased": "id UUID, erased_wall_ns BIGINT",
+    "erased": "id UUID, erased_wall_ns BIGINT, reason VARCHAR",
 }
 _LATER: Final = {"erased"}
-"""The tables that lakes made before them lack until a process writes."""
+"""The tables, one with a later column, that lakes made before them lack until a process writes."""
 _ORPHAN_AGE_S: Final = 3600.0
 """Age from which a file that the catalog does not know is not one of an archive that runs: it commits after seconds."""
-ATTEMPTS: Final = 5
-"""Bounds the attempts to make a lake, or to commit to it, while other processes do."""
+_ATTEMPTS: Final = 5
+"""Bounds the attempts to make a lake while other processes do."""
 _PAGE_EVENTS: Final = 5_000
-_EVENTS_AT_ONCE: Final = 50_000
-"""Bounds the events that one query reads, unless an episode has more; each query reads whole groups of rows."""
+_EVENTS_AT_ONCE: Final = 120_000
+"""Bounds the events that one query reads, unless an episode has more; it reads whole groups of 122,880 rows."""
 
 
 class LakeEpisode(NamedTuple):
@@ -97,7 +98,7 @@ def open_lake(address: str, *, write: bool = False) -> Any:
     options += [] if write else ["READ_ONLY"]
     options += ["META_BUSY_TIMEOUT 30000"] if catalog == "sqlite" else []  # ms; other archives commit meanwhile
     attach = f"ATTACH 'ducklake:{catalog}:{_quoted(place)}' AS lake ({', '.join(options)}); USE lake"
-    for attempt in range(1, ATTEMPTS + 1):
+    for attempt in range(1, _ATTEMPTS + 1):
         connection = _connect("ducklake", f"{catalog}_scanner")
         if catalog == "sqlite":
             _refuse_other_program(address, Path(place))
@@ -106,7 +107,7 @@ def open_lake(address: str, *, write: bool = False) -> Any:
             fault = _prepare(connection, write=write)
         except import_module("duckdb").Error as error:
             connection.close()
-            if not write or attempt == ATTEMPTS:
+            if not write or attempt == _ATTEMPTS:
                 raise unavailable(address, error) from error
             time.sleep(0.1 * attempt)  # another process may be making the lake
             continue
@@ -135,8 +136,10 @@ def _parsed(address: str) -> tuple[str, str, str]:
         return "postgres", place, data
     if "://" in place:
         raise CallerError(f"a lake has its catalog in a folder or on PostgreSQL, not at {place.partition('://')[0]}://")
+    if "#" in address:
+        raise CallerError(f"a lake in a folder has its data there: leave out #{data}")
     folder = Path(place).absolute()
-    return "sqlite", f"{folder}/catalog.sqlite", data or f"{folder}/data"
+    return "sqlite", f"{folder}/catalog.sqlite", f"{folder}/data"
 
 
 def _connect(*extensions: str) -> Any:
@@ -182,8 +185,19 @@ def _prepare(connection: Any, *, write: bool) -> str | None:
             connection.execute(f"INSERT INTO pycrorm_lake VALUES ({_FORMAT})")
         connection.execute("COMMIT")
         connection.execute("CALL lake.set_option('parquet_compression', 'zstd')")
+    if "erased" not in missing and "reason" not in _columns_of_erased(connection):  # an earlier lake
+        if write:
+            connection.execute("ALTER TABLE erased ADD COLUMN reason VARCHAR")
+        else:
+            connection.execute("CREATE TEMP VIEW erased AS SELECT *, NULL::VARCHAR AS reason FROM lake.erased")
+    elif missing and not write:
+        connection.execute(f"CREATE TEMP TABLE erased ({_TABLES['erased']})")
     [(number,)] = connection.execute("SELECT max(format) FROM pycrorm_lake").fetchall()
     return f"was made by a newer version: its format is {number}, this reads {_FORMAT}" if number > _FORMAT else None
+
+
+def _columns_of_erased(connection: Any) -> list[str]:
+    return [name for name, *_ in connection.execute("DESCRIBE lake.erased").fetchall()]
 
 
 def shown(address: str) -> str:
@@ -246,13 +260,21 @@ class Lake:
             raise unavailable(self._given, error) from error
         return rows
 
+    def _table(self, sql: str, parameters: Sequence[Any]) -> Any:
+        """Return the rows of a query as a table of Arrow, at a quarter of the cost of tuples."""
+        try:
+            return self._connection.execute(sql, parameters).to_arrow_table().combine_chunks()
+        except import_module("duckdb").Error as error:
+            raise unavailable(self._given, error) from error
+
     # --- the source of a copy -----------------------------------------------------------------------------------
 
     def episode_rows(self, ids: Collection[str] | None = None) -> dict[str, LakeEpisode]:
-        """Return the episodes, or those of these ids, by id."""
-        chosen = "" if ids is None else "WHERE id IN (SELECT unnest(?)::UUID)"
+        """Return the episodes, or those of these ids, by id; without those that a killed erasure has not deleted."""
+        chosen = "" if ids is None else "AND id IN (SELECT unnest(?)::UUID)"
         columns = "id::VARCHAR, max(head), min(started_wall_ns), max(ended_wall_ns), arg_max(digest, head)"
-        query = f"SELECT {columns} FROM episode {chosen} GROUP BY id ORDER BY id"
+        where = f"WHERE id NOT IN (SELECT id FROM erased) {chosen}"
+        query = f"SELECT {columns} FROM episode {where} GROUP BY id ORDER BY id"
         rows = {row[0]: LakeEpisode(*row) for row in self.execute(query, [] if ids is None else [list(ids)])}
         new = [each for each in rows.values() if each.id not in self._places]
         self._places |= {each.id: place for place, each in enumerate(new, len(self._listed))}
@@ -269,41 +291,57 @@ class Lake:
 
     def named(self, name: str) -> EpisodeRow:
         """Find an episode by its id or first digits of it. Raises `UnknownEpisode`."""
-        rows = self.execute(
-            "SELECT DISTINCT id::VARCHAR FROM episode WHERE starts_with(id::VARCHAR, ?)", [name.lower()]
-        )
+        begins, first = "starts_with(id::VARCHAR, ?)", name.lower()
+        ids = [each for (each,) in self.execute(f"SELECT DISTINCT id::VARCHAR FROM episode WHERE {begins}", [first])]
+        rows = self.episode_rows(ids)
+        if not rows:
+            for identity, why in self._erased(begins, first).items():
+                raise UnknownEpisode(f"{self.address}: episode {identity} was erased on {why}")
         if len(rows) != 1:
             how = "no episode has" if not rows else f"{len(rows)} episodes have"
             raise UnknownEpisode(f"{self.address}: {how} an id that begins with {name!r}")
-        return self.episode_rows([rows[0][0]])[rows[0][0]].row
+        [episode] = rows.values()
+        return episode.row
 
     async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
-        """Yield the events of an episode in pages; one that two memories archived at the same time, once.
+        """Yield the events of an episode in pages; one that two memories archived at the same time, once."""
+        events = self._read(episode)[after:]
+        del self._events[episode.id]
+        for first in range(0, len(events), _PAGE_EVENTS):
+            yield events[first : first + _PAGE_EVENTS]
 
-        Reads it together with those that were listed behind it, because a query costs more than an episode.
-        """
+    def is_intact(self, episode: EpisodeRow) -> bool:
+        """Return whether the events of an episode have the digest that they had in the memory that archived them."""
+        digest = digest_after(RunningDigest.at_start(episode.identity), self._read(episode))
+        return digest == self._listed[self._places[episode.id]].digest
+
+    def _read(self, episode: EpisodeRow) -> list[StoredEvent]:
+        """Read an episode with those that were listed behind it, because a query costs more than an episode."""
         if episode.id not in self._events:
             first = place = self._places[episode.id]
             left = _EVENTS_AT_ONCE - self._listed[first].head
             while (place := place + 1) < len(self._listed) and self._listed[place].head <= left:
                 left -= self._listed[place].head
             self._events = self._events_of([each.id for each in self._listed[first:place]])
-        events = self._events.pop(episode.id, [])[after:]
-        for first in range(0, len(events), _PAGE_EVENTS):
-            yield events[first : first + _PAGE_EVENTS]
+        return self._events[episode.id]
 
     def _events_of(self, ids: Sequence[str]) -> dict[str, list[StoredEvent]]:
+        """Read the events of these episodes, each once; none of an episode that the lake lacks."""
         query = (
-            "SELECT episode::VARCHAR, sequence, type, version, wall_ns, monotonic_ns, encode(payload)"
-            " FROM event WHERE episode IN (SELECT unnest(?)::UUID) AND episode BETWEEN ?::UUID AND ?::UUID"
-            " ORDER BY episode, sequence"
+            "SELECT place, sequence, type, version, wall_ns, monotonic_ns, encode(payload)"
+            " FROM event JOIN (SELECT unnest(?::UUID[]) AS id, unnest(range(?)) AS place) ON episode = id"
+            " WHERE episode BETWEEN ?::UUID AND ?::UUID ORDER BY place, sequence"
         )
-        events: dict[str, list[StoredEvent]] = {}
-        before = None
-        for row in self.execute(query, [[*ids], min(ids), max(ids)]) if ids else ():
-            if row != before:
-                events.setdefault(row[0], []).append(make(StoredEvent, (0, *row[1:])))
-            before = row
+        events: dict[str, list[StoredEvent]] = {each: [] for each in ids}
+        if ids:
+            places, *columns = self._table(query, [ids, len(ids), min(ids), max(ids)]).columns
+            runs = import_module("pyarrow.compute").run_end_encode(places.combine_chunks())
+            values = zip(repeat(0), *(each.to_pylist() for each in columns), strict=False)
+            rows, end = map(make, repeat(StoredEvent), values), 0
+            for place, run_end in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
+                some = [*islice(rows, run_end - end)]
+                end = run_end
+                events[ids[place]] = some if some[-1].sequence == len(some) else [each for each, _ in groupby(some)]
         return events
 
     async def declarations(self) -> list[bytes]:
@@ -313,6 +351,8 @@ class Lake:
 
     async def descriptions(self, fingerprints: Collection[str]) -> dict[str, bytes]:
         """Read the payloads of these descriptions, by fingerprint."""
+        if not fingerprints:
+            return {}
         query = "SELECT DISTINCT fingerprint, payload FROM declaration WHERE fingerprint IN (SELECT unnest(?))"
         return {name: payload.encode() for name, payload in self.execute(query, [list(fingerprints)])}
 
@@ -342,12 +382,11 @@ class Lake:
         this check or its deletion comes last.
         """
         ids = [each.id for each, _ in episodes]
-        events = [(each.id, *event[1:]) for each, some in episodes for event in some]
         try:
             self.execute("BEGIN")
             self.execute("DELETE FROM episode WHERE id IN (SELECT unnest(?)::UUID)", [ids])
             self._insert("episode", [(*each, memory) for each, _ in episodes])
-            self._insert("event", events)
+            self._insert_events(episodes)
             self._insert("declaration", list(declarations.items()))
             self._insert("blob", [(name, *blob) for name, blob in blobs.items()])
             self.execute("COMMIT")
@@ -364,18 +403,34 @@ class Lake:
         if rows:
             arrow: Any = import_module("pyarrow")
             columns = [arrow.array(values) for values in zip(*rows, strict=True)]
-            named = {f"c{place}": column for place, column in enumerate(columns)}
-            self._connection.register("new_rows", arrow.table(named))
-            decoded = {"event": "* REPLACE (decode(c6) AS c6)", "declaration": "* REPLACE (decode(c1) AS c1)"}
-            try:
-                self.execute(f"INSERT INTO {table} SELECT {decoded.get(table, '*')} FROM new_rows ORDER BY c0, c1")
-            finally:
-                self._connection.unregister("new_rows")
+            self._insert_columns(table, columns, "* REPLACE (decode(c1) AS c1)" if table == "declaration" else "*")
 
-    def erased(self, ids: Collection[str]) -> dict[str, int]:
-        """Return when those of these episodes were erased that the lake takes from no memory any more, by id."""
-        query = "SELECT id::VARCHAR, min(erased_wall_ns) FROM erased WHERE id IN (SELECT unnest(?)::UUID) GROUP BY id"
-        return dict(self.execute(query, [[*ids]]))
+    def _insert_events(self, episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]]) -> None:
+        """Insert events in the order of episodes and sequences, in which DuckDB keeps them."""
+        arrow: Any = import_module("pyarrow")
+        of_episode = sorted((each.id, some) for each, some in episodes if some)
+        if of_episode:
+            _, *columns = zip(*chain.from_iterable(some for _, some in of_episode), strict=True)
+            places = chain.from_iterable(repeat(place, len(some)) for place, (_, some) in enumerate(of_episode))
+            ids = arrow.DictionaryArray.from_arrays(arrow.array(places, "int32"), [each for each, _ in of_episode])
+            self._insert_columns("event", [ids, *map(arrow.array, columns)], "* REPLACE (decode(c6) AS c6)")
+
+    def _insert_columns(self, table: str, columns: Sequence[Any], selected: str) -> None:
+        named = {f"c{place}": column for place, column in enumerate(columns)}
+        self._connection.register("new_rows", import_module("pyarrow").table(named))
+        try:
+            self.execute(f"INSERT INTO {table} SELECT {selected} FROM new_rows")
+        finally:
+            self._connection.unregister("new_rows")
+
+    def erased(self, ids: Collection[str]) -> dict[str, str]:
+        """Return when and why those of these episodes were erased that the lake takes from no memory, by id."""
+        return self._erased("id IN (SELECT unnest(?)::UUID)", [*ids])
+
+    def _erased(self, condition: str, value: object) -> dict[str, str]:
+        columns = "id::VARCHAR, min(erased_wall_ns), arg_min(reason, erased_wall_ns)"
+        rows = self.execute(f"SELECT {columns} FROM erased WHERE {condition} GROUP BY id", [value])
+        return {name: when_and_why(wall_ns, reason) for name, wall_ns, reason in rows}
 
     def clear_orphans(self, ids: Collection[str] = ()) -> list[str]:
         """Delete files that a killed archive left; return those that stay and may have events of these episodes.
@@ -415,14 +470,14 @@ class Lake:
         query = f"SELECT DISTINCT {key} FROM {table} WHERE {key} IN (SELECT unnest(?))"
         return {*names} - {name for (name,) in self.execute(query, [[*names]])}
 
-    def erase(self, ids: Sequence[str]) -> list[str]:
-        """Erase episodes: write the files again without them, delete the old ones, and keep the ids.
+    def erase(self, ids: Sequence[str], reason: str = "") -> list[str]:
+        """Erase episodes: write the files again without them, delete the old ones, and keep ids and reason.
 
         Does so too where a call that was killed has deleted their rows. Returns files that still have events of them:
         those of an archive that runs or was killed a short time ago. Close the lake after an error.
         """
         now_ns, before = SYSTEM_CLOCK.wall_ns(), self.erased(ids)
-        if new := [(name, now_ns) for name in ids if name not in before]:
+        if new := [(name, now_ns, reason) for name in ids if name not in before]:
             self._insert("erased", new)
         query = "SELECT type, encode(payload) FROM event WHERE episode IN (SELECT unnest(?)::UUID)"
         referring = self.execute(f"{query} AND contains(payload, '\"$blob\"')", [list(ids)])
@@ -466,7 +521,7 @@ def digest_after(running: RunningDigest, events: Sequence[StoredEvent]) -> str:
     return ends[-1][1] if ends and ends[-1][0] == running.sequence else running.digest()
 
 
-def erase_in_lake(address: str, ids: Sequence[str]) -> list[str]:
+def erase_in_lake(address: str, ids: Sequence[str], reason: str) -> list[str]:
     """Erase episodes in a lake, which has to be there, also from the free pages of a catalog in a file.
 
     Returns files that still have events of them, as `Lake.erase` does.
@@ -474,7 +529,7 @@ def erase_in_lake(address: str, ids: Sequence[str]) -> list[str]:
     open_lake(address).close()  # makes none: a folder that is not mounted still holds them
     lake = Lake(address, write=True)
     try:
-        left = lake.erase(ids)
+        left = lake.erase(ids, reason)
     finally:
         lake._connection.close()  # noqa: SLF001 - of this module
     catalog, place, _ = _parsed(address)

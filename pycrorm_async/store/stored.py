@@ -113,13 +113,22 @@ class RemovedEpisode(NamedTuple):
     restored_wall_ns: int | None = None
 
     def __str__(self) -> str:
-        when = f"{datetime.fromtimestamp(self.removed_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC ({self.reason})"
+        when = when_and_why(self.removed_wall_ns, self.reason)
         if self.archived_in is None:
             return f"episode {self.number} ({self.id}) was erased on {when}"
         return (
             f"episode {self.number} ({self.id}) was archived on {when}:"
             f" `pycrorm restore {self.id} --from {self.archived_in}` brings it back"
         )
+
+
+def when_and_why(wall_ns: int, reason: str | None) -> str:
+    """Return the time of a removal, and its reason if it is known.
+
+    >>> when_and_why(1_700_000_000_000_000_000, "asked")
+    '2023-11-14 22:13 UTC (asked)'
+    """
+    return f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC" + (f" ({reason})" if reason else "")
 
 
 class Stored(NamedTuple):

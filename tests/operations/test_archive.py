@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from pycrorm_async.operations.removal import erasable, erase
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.lake import Lake, erase_in_lake, query_lake
+from pycrorm_async.store.lake import Lake, erase_in_lake, open_lake, query_lake
 from pycrorm_async.store.log import EventLog
 from tests.commands import pycrorm
 from tests.crash.forked_processes import ForkedProcess, die_at_statement
@@ -149,8 +150,15 @@ async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp
     query = f"SELECT count(*) FROM read_parquet({parquet}) WHERE payload LIKE '%{SECRET}%'"
     assert query_lake(lake, query)[1] == [(0,)]
     assert places_with(SECRET, url) == []
-    with pytest.raises(UnknownEpisode):
+    with pytest.raises(UnknownEpisode, match=rf"^episode 2 \({ids[1]}\) was erased on .* UTC \(asked to\)$"):
         await copy_episodes(lake, url, episodes=[ids[1]])
+    other = put_memory(tmp_path / "other.db")
+    with pytest.raises(UnknownEpisode, match=rf"{ids[1]} was erased on .* UTC \(asked to\)$"):
+        await copy_episodes(lake, other, episodes=[ids[1]])
+    with closing(open_lake(lake, write=True)) as connection:  # as an earlier version left it
+        connection.execute("ALTER TABLE erased DROP COLUMN reason")
+    with pytest.raises(UnknownEpisode, match=rf"{ids[1]} was erased on .* UTC$"):
+        await copy_episodes(lake, other, episodes=[ids[1]])
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:  # one that came back, and that the lake still holds, is archived nowhere else, and erased there too
         await copy_episodes(lake, url)
@@ -175,7 +183,7 @@ def erase_until(lake: str, episode: str, last: int) -> None:
         return rows
 
     Lake.execute = die_after_last  # type: ignore[method-assign]
-    erase_in_lake(lake, [episode])
+    erase_in_lake(lake, [episode], "asked")
 
 
 async def test_an_erasure_that_is_killed_at_any_step_is_finished_by_the_next(tmp_path: Path, lake: str) -> None:
@@ -185,6 +193,8 @@ async def test_an_erasure_that_is_killed_at_any_step_is_finished_by_the_next(tmp
         await archived(url, lake)
         process = ForkedProcess(erase_until, lake, ids[1], last)
         assert process.wait() in (-9, 0), process.lines
+        with pytest.raises(UnknownEpisode, match="was erased on"):  # what is left of it is not restored
+            await copy_episodes(lake, url, episodes=[ids[1]])
         await erased(url, ids[1])
         files = [str(each) for each in (tmp_path / "lake/data/main/event").iterdir()]
         query = f"SELECT count(*) FROM read_parquet({files}, union_by_name => true) WHERE episode = '{ids[1]}'"
@@ -302,6 +312,22 @@ async def test_an_erasure_that_left_files_in_the_lake_of_an_archived_episode_vis
     parquet_files(lake, aged=True)
     assert [each.left for each in await erased(url, identity)] == [()]
     assert not parquet_files(lake)
+
+
+async def test_of_an_episode_that_was_changed_in_the_lake_the_events_before_an_unreadable_one_are_restored(
+    tmp_path: Path, lake: str
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    ids = await recorded(url, "first", "second", "third")
+    await archived(url, lake)
+    with closing(open_lake(lake, write=True)) as connection:
+        for episode, payload in ((ids[0], "'{'"), (ids[1], "payload || ' '")):
+            connection.execute(f"UPDATE event SET payload = {payload} WHERE episode = '{episode}' AND sequence = 3")
+    unreadable, changed, whole = (await copy_episodes(lake, url)).episodes
+    assert (unreadable.head, changed.head, whole.head) == (2, whole.head, whole.copied)
+    assert f"{ids[0]}, event 3: its payload cannot be read" in str(unreadable.damage)
+    assert f"{ids[1]}: its digest differs from that in {lake}" in str(changed.damage)
+    assert whole.damage is None
 
 
 async def test_a_lake_takes_no_episode_again_that_was_erased_from_it(tmp_path: Path, lake: str) -> None:

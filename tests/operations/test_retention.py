@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.types import EpisodeTagged
 from pycrorm_async.operations.copy import _append
+from pycrorm_async.operations.removal import erasable
 from pycrorm_async.operations.retention import (
     RetentionRule,
     add_rule,
@@ -110,12 +110,16 @@ async def test_what_no_rule_keeps_goes_and_what_runs_or_is_kept_by_its_tag_stays
         assert query_lake(place, "SELECT count(*) FROM episode")[1] == [(2,)]
     else:
         assert all(each.left for each in result.erased)  # the recorder that ran had the segment
+        rename = "UPDATE pycrorm_removed_episode SET reason = '{}' WHERE number = 1"
+        ask_to_change(database_url, rename.format("retention policy of the lab"))  # of a user, who finishes it
         log = await EventLog.open(address, create=True)
         try:
-            finished = await apply_rules(database_url, log, (), late_ns, spool=spool)
+            for number, reason in (3, "retention --keep 9d"), (1, ""):
+                finished = await apply_rules(database_url, log, (), late_ns, spool=spool)
+                assert [(each.removed.number, each.left) for each in finished.erased] == [(number, ())]
+                ask_to_change(database_url, rename.format(reason))
         finally:
             await log.close()
-        assert [(each.removed.number, each.left) for each in finished.erased] == [(1, ()), (3, ())]
         assert places_with("Amsel", database_url) == []
     await assert_clean(database_url)
 
@@ -165,20 +169,56 @@ async def test_without_tables_of_this_version_the_tags_are_read_from_the_log(tmp
 
 
 @pytest.mark.slow
-async def test_a_lake_that_is_away_does_not_keep_what_is_to_be_erased(tmp_path: Path) -> None:
+async def test_a_lake_that_is_away_keeps_only_what_it_would_get_and_the_rest_is_shown(tmp_path: Path) -> None:
+    pytest.importorskip("duckdb_extension_ducklake", reason="the extra [lake] is not installed")
     url = f"sqlite:///{tmp_path}/memory.db"
     async with Memory.open(url) as memory:
-        for tags in (("moved",), ()):
+        for tags in (("away",), ("there",), ()):
             async with memory.episode(description="old", tags=tags):
                 pass
+    shift = "SET started_wall_ns = started_wall_ns - {0}, ended_wall_ns = ended_wall_ns - {0}"
+    ask_to_change(url, f"UPDATE episode {shift.format(2 * DAY_S * 10**9)}")
     (tmp_path / "away").touch()  # where the folder of the lake was
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:
-        await add_rule(log, "1d", timedelta(days=1), ("moved",), f"ducklake:{tmp_path}/away")
+        for tag in ("away", "there"):
+            await add_rule(log, "1d", timedelta(days=1), (tag,), f"ducklake:{tmp_path}/{tag}")
         await add_rule(log, "1d", timedelta(days=1), (), None)
-        with pytest.raises(PycrormError):
-            await apply_rules(url, log, {1, 2}, 2**62, spool=tmp_path / "spool")
-        assert [each.number for each in await log.episodes()] == [1]
+    finally:
+        await log.close()
+    done = pycrorm("retention", "apply", "--yes", "--json", "--url", url, cwd=tmp_path)
+    assert done.returncode == 3, done.stderr
+    assert f"ducklake:{tmp_path}/away" in one_line_of(done)
+    outcomes = ["stays: parked, not visible yet, or changed meanwhile", "archived", "erased"]
+    assert [each["then"] for each in json.loads(done.stdout)] == outcomes
+    assert ask(url, "SELECT number FROM episode") == [(1,)]
+
+
+@pytest.mark.slow
+async def test_an_episode_of_a_clock_that_was_years_behind_is_as_old_as_what_was_stored_before_it(
+    tmp_path: Path,
+) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url) as memory:
+        for each in "abcd":
+            async with memory.episode(description=each):
+                pass
+    ask_to_change(url, "UPDATE episode SET started_wall_ns = 0, ended_wall_ns = 9 WHERE number IN (1, 4)")  # 1970
+    day_ns = DAY_S * 10**9
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        rows = {each.number: each for each in await log.episodes()}
+        await add_rule(log, "1d", timedelta(days=1), (), None)
+        rules, last_ns = await read_rules(log), rows[3].started_wall_ns
+
+        async def due(now_ns: int) -> list[int]:
+            return [each.row.number for each in await due_episodes(log, rules, now_ns)]
+
+        assert await due(last_ns) == [1]  # nothing shows that it is younger
+        assert 4 not in await due(last_ns + day_ns)
+        assert 4 in await due(last_ns + day_ns + 1)
+        old = await erasable(log, [], ended_before=datetime.fromtimestamp(last_ns / 1e9 - 1, UTC))
+        assert [each.number for each in old] == [1]
     finally:
         await log.close()
 
@@ -214,6 +254,8 @@ async def test_the_command_lists_tries_asks_and_applies(tmp_path: Path) -> None:
     [due] = json.loads(run("apply", "--yes", "--json"))
     assert due["then"] == "erased"
     assert "retention --keep 30d" in pycrorm("erase", "--url", url, cwd=tmp_path).stdout
+    refused = pycrorm("erase", "2", "--reason", "retention --keep 9d", "--yes", "--url", url, cwd=tmp_path)
+    assert (refused.returncode, "is that of a rule" in one_line_of(refused)) == (2, True)
     run("remove", "1")
     assert "there is no rule 1: `pycrorm retention list`" in run("remove", "1", code=2)
     assert [each["number"] for each in json.loads(run("list", "--json"))] == [2]
