@@ -71,7 +71,7 @@ class Camera:
 
     Args:
         size: width and height in pixels of all images.
-        is_video: whether they are kept in videos, which `encoder` must be able to write; otherwise in the rows.
+        is_video: whether they are kept in videos, which need `has_encoder`; otherwise in the rows.
     """
 
     def __init__(self, feature: str, size: ImageSize, folder: Path, fps: int, *, is_video: bool) -> None:
@@ -103,7 +103,7 @@ class Camera:
             self._samples.append(observed_images.smaller(pixels, _SAMPLED_SIDE))
         self._count += 1
         if self._last is None or self._last[0] is not pixels:  # many frames share an image
-            self._last = pixels, self._frame(pixels) if self.is_video else observed_images.png_of(pixels, 9)
+            self._last = pixels, self._frame(pixels) if self.is_video else observed_images.png_of(pixels)
         if not self.is_video:
             return {"bytes": self._last[1], "path": None}
         frame = self._last[1]
@@ -219,12 +219,12 @@ class ObservedCamera:
             latest = bisect_right(seen, sequence, key=lambda each: each[0]) - 1
             for index in range(latest, used, -1):  # the one before where the last cannot be read
                 try:
-                    found = observed_images.rgb_of(seen[index][1], _content(read, seen[index][1]))
+                    image = observed_images.rgb_of(seen[index][1], _content(read, seen[index][1]))
                 except ValueError as reason:
                     self._unreadable, self._reason = self._unreadable + 1, str(reason)
                     continue
-                self._scaled += found.shape != pixels.shape
-                pixels = found if found.shape == pixels.shape else observed_images.resized(found, self.size)
+                self._scaled += image.shape != pixels.shape
+                pixels = image if image.shape == pixels.shape else observed_images.resized(image, self.size)
                 self._used, is_black = self._used + 1, False
                 break
             used = max(used, latest)
@@ -259,10 +259,11 @@ def _camera_of(name: str, content: Content) -> str | None:
 async def observed_cameras(reading: Reading, episodes: Sequence[CoveredEpisode]) -> list[ObservedCamera]:
     """Return the cameras whose images were observed in any of these episodes, in the order of their first images.
 
-    Log that they are left out if Pillow is not installed. An event or an episode that cannot be read counts as none.
+    Log which are left out, because Pillow is not installed or no image of them can be read.
     """
     log = await reading.log()
     cameras: dict[str, ObservedCamera] = {}
+    unreadable: dict[str, str] = {}
     for covered in episodes:
         with suppress(PycrormError):  # the export of this episode names the fault
             async for content_name, content in _contents(log, covered):
@@ -274,9 +275,14 @@ async def observed_cameras(reading: Reading, episodes: Sequence[CoveredEpisode])
                     return []
                 with log.translated():
                     data = await log.blobs.read_blob(content.hash)
-                with suppress(ValueError):  # a later one may be readable
+                try:
                     height, width, _ = observed_images.rgb_of(content, data or b"").shape
+                except ValueError as reason:
+                    unreadable[name] = str(reason)  # a later one may be readable
+                else:
                     cameras[name] = ObservedCamera(name, (width, height))
+    for name in unreadable.keys() - cameras.keys():
+        _log.warning("camera %s is left out: no image of it can be read (%s)", name, unreadable[name])
     return [*cameras.values()]
 
 
@@ -284,9 +290,12 @@ async def _contents(log: EventLog, covered: CoveredEpisode) -> AsyncIterator[tup
     [row] = await log.episodes(covered.number, covered.number)
     async for page in log.pages(row._replace(head=covered.events)):
         for event in page:
-            if event.type == "Observed" and isinstance(happening := happening_of(event), Observed):
-                for each in scenes.contents_of(happening):
-                    yield each
+            happening = None
+            if event.type == "Observed":
+                with suppress(PycrormError):  # what this program cannot decode has no images
+                    happening = happening_of(event)
+            for each in scenes.contents_of(happening) if isinstance(happening, Observed) else ():
+                yield each
 
 
 def features_of(cameras: Collection[ObservedCamera], folder: Path, fps: int) -> list[Camera]:

@@ -328,6 +328,7 @@ async def filmed(tmp_path: Path) -> AsyncIterator[Reading]:
                     for each in seen.get(move, ()):
                         episode.observe("head/camera", {"rgb": each})
                         episode.observe("small", image(90, (32, 24))[..., 0])
+                        episode.observe("broken", Blob(b"no image", "image/png"))
                         episode.observe("depth", np.linspace(0.5, 2, 400, dtype=np.float32).reshape(20, 20))
                         if number == 1:
                             episode.observe("wrist", image(50))
@@ -414,6 +415,8 @@ async def test_observed_images_are_videos_of_the_last_one_before_each_frame(
     small_note = "small are PNGs in the rows, because videos have sides of 64 to 4096 pixels, and these 32 x 24"
     assert head_note in caplog.text
     assert small_note in caplog.text
+    broken_note = "camera broken is left out: no image of it can be read (it is no PNG, JPEG, GIF or WebP image)"
+    assert broken_note in caplog.text
     assert (await export_again(filmed, folder.with_name("film.manifest.json"))).same
 
 
