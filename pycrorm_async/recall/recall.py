@@ -224,11 +224,13 @@ class Recall:
         return predict(library, situations, unlike_episodes(await self._rollouts(library)))
 
     async def _rollouts(self, library: CaseLibrary) -> Sequence[tuple[int, str | None]]:
-        """Return the numbers of the episodes with rollouts, each with the scene of a batch."""
+        """Return the numbers of the stored episodes with rollouts, each with the scene of a batch."""
         batch, count = BatchRolloutAction, library.size("BatchRolloutAction")
         if count != self._batches[0]:
-            rows = await self._reading.rows(select(batch.process_metadata_id, batch.scene).distinct())
-            self._batches = count, [(number, scene) for number, scene in rows]
+            rows = await self._reading.rows(select(batch.id, batch.process_metadata_id, batch.scene))
+            ids = [node for node, _, _ in rows]
+            is_whole = all(np.isin(each.nodes, ids).all() for each in library.groups("BatchRolloutAction"))
+            self._batches = count if is_whole else -1, list({(number, scene) for _, number, scene in rows})
         return self._batches[1]
 
     def _answer(self, cue: search.Cue, library: CaseLibrary) -> Answer:

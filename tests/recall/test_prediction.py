@@ -187,6 +187,13 @@ async def test_rollouts_under_other_conditions_do_not_count(database_url: str, t
                 return round((await memory.predict(move)).tries)
 
         assert [await compared_in(scene) for scene in (hard, *others)] == [3, 4, 5, 6, 7]
+        async with memory.episode(description="a batch that this process has not stored when it predicts"):
+            with hard.entered() as stage:
+                tries = MoveAndPickUp(stage.target, [Arms.LEFT], [Grasp.FRONT], here)
+                await batch_rollout(tries, 1, seed=2, scene=str(hard), reset=stage.reset)
+            await compared_in(hard)
+        await memory.flush()
+        assert [await compared_in(scene) for scene in (hard, *others)] == [4, 4, 5, 6, 7]
 
 
 def test_a_sync_memory_predicts_too(tmp_path: Path) -> None:
