@@ -6,10 +6,11 @@
 
 The memories hold random episodes of some 50 events; the one that is asked about is the same in all of them, and in the
 middle. The sizes take turns, and the least CPU time of the rounds counts. On SQLite it is the CPU time of the process,
-which runs the database. On PostgreSQL it is that of the client, and the server's work is given as the rows that all
+which runs the database; its work is also given as the steps of SQLite's virtual machine, in hundreds, which are the
+same on a busy machine. On PostgreSQL it is that of the client, and the server's work is given as the rows that all
 steps of all plans read. `list` is `pycrorm episodes`, `append` a batch of 100 further episodes. The script prints one
-JSON line: by database, question and size the CPU time in ms and the rows read, with the ratio of the largest size to
-the smallest.
+JSON line: by database, question and size the CPU time in ms and the rows read or the steps, with the ratio of the CPU
+time at the largest size to that at the smallest.
 """
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ async def rows_read(url: str, question: Ask) -> int:
 
 
 async def measure(url_of: dict[int, str], rounds: int) -> dict[str, dict[str, Any]]:
-    """Return CPU time and rows read, by question and number of episodes."""
+    """Return CPU time and rows read, or steps, by question and number of episodes."""
     figures: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as folder:
         least: dict[tuple[str, int], float] = {}
@@ -242,12 +243,17 @@ async def measure(url_of: dict[int, str], rounds: int) -> dict[str, dict[str, An
                         least[name, size] = min(least.get((name, size), 1e9), await cpu_s(question))
         for size, url in url_of.items():
             own = Path(tempfile.mkdtemp(dir=folder))
-            async with questions_of(url, size // 2, own) as questions:
-                for name, question in questions.items():
-                    entry = figures.setdefault(name, {"cpu_ms": {}, "rows": {}})
-                    entry["cpu_ms"][size] = round(least[name, size] * 1000, 2)
-                    if url.startswith("postgresql") and name not in WRITING:
-                        entry["rows"][size] = await rows_read(url, question)
+            with Steps() as steps:
+                async with questions_of(url, size // 2, own) as questions:
+                    for name, question in questions.items():
+                        entry = figures.setdefault(name, {"cpu_ms": {}, "rows": {}, "hundred_steps": {}})
+                        entry["cpu_ms"][size] = round(least[name, size] * 1000, 2)
+                        if not url.startswith("postgresql"):
+                            steps.hundreds = 0
+                            await question()
+                            entry["hundred_steps"][size] = steps.hundreds
+                        elif name not in WRITING:
+                            entry["rows"][size] = await rows_read(url, question)
     first, last = min(url_of), max(url_of)
     for each in figures.values():
         each["ratio"] = round(each["cpu_ms"][last] / each["cpu_ms"][first], 2)

@@ -12,14 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from bench.one_episode import Steps, fill, questions_of, rows_read
+from bench.one_episode import WRITING, Steps, fill, questions_of, rows_read
 from tests.databases import Server, ask_to_change, put_memory, run_in_own_loop
 
 FEW = 50
 OF_ALL = {"copy in", "list"}
 """The fold of recall looks at the checkpoint of each episode of the memory that it folds into; a list has many."""
-FROM_SIZE_ON = {"verify"}
-"""On PostgreSQL it reads 2.5 times the rows among 5,000 episodes, and the same among 1,500."""
 RATIO_MAX = 1.5
 SLACK = 10
 """Units of work that a deeper index may cost."""
@@ -53,14 +51,13 @@ async def test_a_question_about_one_episode_costs_the_same_however_many_episodes
     few_and_many: dict[int, str], tmp_path: Path
 ) -> None:
     work: dict[str, list[int]] = {}
-    size_max = max(few_and_many)
     for size, url in few_and_many.items():
         folder = tmp_path / f"files of {size}"
         folder.mkdir()
         with Steps() as steps:
             async with questions_of(url, size // 2, folder) as questions:
                 for name, question in questions.items():
-                    if name in OF_ALL or (name in FROM_SIZE_ON and size_max > 1_000 and url.startswith("postgresql")):
+                    if name in OF_ALL or (name in WRITING and url.startswith("postgresql")):
                         continue
                     await question()  # the first time it may learn declarations
                     if url.startswith("postgresql"):
