@@ -59,6 +59,8 @@ _CODEC, _PIXEL_FORMAT = "libsvtav1", "yuv420p"
 _CODEC_OPTIONS = {"g": "2", "crf": "30", "preset": "12"}
 _VIDEO_SIDES = range(64, 4097)
 """Sides in pixels that are encoded as video: SVT-AV1 4.1 never returns from a few narrow formats, such as 2000 x 16."""
+_VIDEO_FPS_MAX = 240
+"""Bounds the rate of a video, as SVT-AV1 does."""
 _SAMPLED_MAX, _SAMPLED_SIDE = 100, 150
 """Bounds the images of an episode from which statistics are computed, and their sides in pixels, as LeRobot does."""
 
@@ -308,15 +310,11 @@ def features_of(cameras: Collection[ObservedCamera], folder: Path, fps: int) -> 
         )
     features = []
     for each in cameras:
-        fits = all(side in _VIDEO_SIDES for side in each.size)
+        fits = fps <= _VIDEO_FPS_MAX and all(side in _VIDEO_SIDES for side in each.size)
         if can_encode and not fits:
-            _log.warning(
-                "images of %s are PNGs in the rows, because videos have sides of %d to %d pixels, and these %d x %d",
-                each.name,
-                _VIDEO_SIDES[0],
-                _VIDEO_SIDES[-1],
-                *each.size,
-            )
+            bounds = f"{_VIDEO_SIDES[0]} to {_VIDEO_SIDES[-1]} pixels and at most {_VIDEO_FPS_MAX} frames a second"
+            reason = "images of %s are PNGs in the rows, because videos have sides of %s, and these %d x %d at %d"
+            _log.warning(reason, each.name, bounds, *each.size, fps)
         features.append(Camera(each.feature, each.size, folder, fps, is_video=can_encode and fits))
     return features
 

@@ -412,7 +412,10 @@ async def test_observed_images_are_videos_of_the_last_one_before_each_frame(
         " (--clock time takes frames at a rate); black frames before the first image: 4; images of other sizes, scaled"
         " to 96 x 64: 2; images that cannot be read: 2 (it is no PNG, JPEG, GIF or WebP image)"
     )
-    small_note = "small are PNGs in the rows, because videos have sides of 64 to 4096 pixels, and these 32 x 24"
+    small_note = (
+        "small are PNGs in the rows, because videos have sides of 64 to 4096 pixels and at most 240 frames a second,"
+        " and these 32 x 24 at 30"
+    )
     assert head_note in caplog.text
     assert small_note in caplog.text
     broken_note = "camera broken is left out: no image of it can be read (it is no PNG, JPEG, GIF or WebP image)"
@@ -432,6 +435,9 @@ async def test_without_pyav_observed_images_are_png_in_the_rows(
     pictures = [Image.open(io.BytesIO(each["bytes"])) for each in rows["observation.images.head_camera.rgb"]]
     assert {(each.format, each.size) for each in pictures} == {("PNG", SIDE)}
     assert levels_of([np.asarray(each) for each in pictures]) == pytest.approx(HEAD, abs=3)
+    assert not [*tmp_path.rglob("*.mp4")]
+    monkeypatch.undo()
+    await export(filmed, 1, tmp_path / "fast", file_format="lerobot", fps=241)  # of which the encoder would fail
     assert not [*tmp_path.rglob("*.mp4")]
     await export(filmed, 1, tmp_path / "states", file_format="lerobot", images="none")
     assert not [each for each in pd.read_parquet(tmp_path / "states/data") if "images" in each]
