@@ -1,8 +1,8 @@
 """Measure whole tasks: fetch an object from a table and place it on another one, with and without experience.
 
-    python -m bench.tasks                 200 tasks, all policies, without and with errors of the robot
-    python -m bench.tasks --tasks 30      fewer
-    python -m bench.tasks --only model    one row
+    python -m bench.tasks                     60 tasks, all rows, without and with errors of the robot
+    python -m bench.tasks --tasks 200 --kept tasks.jsonl      continues after an interruption
+    python -m bench.tasks --only "model, checked" --errors none
 
 Each task is drawn from (seed, number): two tables of 0.7 m by 1.4 m, 0.5 to 1.1 m high and turned at random, 3.2 m
 apart; milk, cereal or pringles 8 to 25 cm behind the edge of one, turned at random; its goal as far behind the
@@ -17,13 +17,15 @@ arm and held object count, and the gripper opens 8.6 cm. `Retry` has five tries.
 | model | the likeliest ways of a success model, nothing checked |
 | model, checked | the likeliest ways of a success model that kinematics and collisions allow |
 
-The model learns from pick-ups alone, in four rounds of 2,500 at single tables (`Scene`), with the errors of the row.
+The model learns from pick-ups alone, in eight rounds of 750 at single tables (`Scene`), with the errors of the row.
 Errors: the base misses its place by 2 cm and 2°, the object is 0.5 cm and 3° beside its believed pose (standard
-deviations), 1 % slip. A try counts as failed if it was made and did not pick up; in the last column a task that is
-given up also counts the tries that are left. The ceiling is the share of tasks in which any of 4,000 ways to pick up,
-and a place for placing it, works without errors. Intervals are of 95 %.
+deviations), 1 % slip. A try counts as failed if it was made and did not pick up; *all tries* also counts, of a task in
+which no try picked up, the tries that were left. Intervals are of 95 %.
 
-The script prints one JSON line; the table is on stderr.
+A task can be *solved* if an arm and a grasp that fit the object pick it up from any place of a grid and place it from
+any, without errors: places 6 cm apart, five heights of the torso, and for placing nine headings, or if a row did it.
+
+The script prints one JSON line; progress and the table are on stderr.
 """
 
 from __future__ import annotations
@@ -32,12 +34,13 @@ import argparse
 import asyncio
 import json
 import math
+import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import compress, product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -49,6 +52,7 @@ from rich.table import Table
 
 from pycrorm_async.errors import NotEnoughExperience
 from pycrorm_async.learning import Disturbance, MoveAndPickUp, Scene, load_policy, save_policy
+from pycrorm_async.learning.move_and_pick_up import context_of
 from pycrorm_async.learning.policy_file import AnyPolicy
 from pycrorm_async.learning.rollouts import randomness
 from pycrorm_async.learning.scenes import DisturbedModules
@@ -61,25 +65,34 @@ from pycrorm_async.plan import (
     TransportAction,
     TransportActionPerformable,
 )
-from pycrorm_async.plan.locations import base_clearance
+from pycrorm_async.plan.actions import MoveAndPickUpPerformable
+from pycrorm_async.plan.geometry import retract
+from pycrorm_async.plan.locations import base_clearance, base_height_m, face, reaching_arms
 from pycrorm_async.plan.motions import ChosenRobot, SimulatedModules
+from pycrorm_async.plan.objects import designator_of, require_robot
 from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.query.success import interval_95
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.urdf import Limits
+from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, Limits
 
 TRIES = 5
-CANDIDATES, TURNS = 4_000, 10
+BATCH = 5
+"""Tasks of one job: the results of finished ones are kept."""
+CELL_M, TORSOS = 0.06, 5
+PLACES_M = (0.3, 1.15)
+"""Limits of the distance of the base from the object in the grid of places."""
+TURNS = tuple(side * turn for turn in (0.4, 0.8, 1.2, 1.8) for side in (1, -1))
+"""Headings of the base in the grid, rad from that which faces the goal; these are tried last."""
 OBJECTS = (ObjectType.MILK, ObjectType.BREAKFAST_CEREAL, ObjectType.PRINGLES)
 ERRORS = Disturbance(base_m=0.02, base_rad=math.radians(2), object_m=0.005, object_rad=math.radians(3), slip=0.01)
 TORSO_M = 0.2
 LEARNING = Scene(
     heights=(0.6, 1.25), turned=True, others=OBJECTS[1:], table=True, parked=True, collisions=True, torso_height=TORSO_M
 )
-ROUNDS, ROLLOUTS = 4, 2_500
+ROUNDS, ROLLOUTS = 8, 750
 ROWS = ("TransportAction", "random", "random, checked", "model", "model, checked")
 
 
@@ -96,13 +109,13 @@ async def learned(scene: Scene, seed: int, *, rounds: int = ROUNDS, rollouts: in
                 stage.reset()
                 action = MoveAndPickUp(stage.prepare(seed + number, index), policy=model)
                 with suppress(PlanFailure):  # no place is free
-                    rows.append(await _tried(action.drawn(randomness(seed + number, index))))
+                    rows.append(await tried(action.drawn(randomness(seed + number, index))))
             with suppress(NotEnoughExperience):  # a further round may succeed more often
                 model = SuccessModel.fit(pd.DataFrame(rows)).drawing(Draws.UNCERTAIN)
     return model.drawing(Draws.CONFIDENT)
 
 
-async def _tried(way: Any) -> dict[str, Any]:
+async def tried(way: Any) -> dict[str, Any]:
     status = TaskStatus.SUCCEEDED
     try:
         await way.perform()
@@ -133,10 +146,12 @@ class Kitchen:
         rng = np.random.default_rng((seed, number, 1))
         if isinstance(self.modules, DisturbedModules):
             self.modules.rng = np.random.default_rng((seed, number, 2))
-        assert self.robot.robot_description is not None
-        for each in self.robot.robot_description.arms.values():
+        description = self.robot.robot_description
+        assert description is not None
+        assert description.torso_joint is not None
+        for each in description.arms.values():
             self.robot.set_joint_positions(dict(each.park))
-        self.robot.set_joint_position("torso_lift_joint", TORSO_M)
+        self.robot.set_joint_position(description.torso_joint, TORSO_M)
         thing = self.things[rng.integers(len(self.things))]
         underside = thing.bounding_box().min.z - thing.pose.position.z
         places = []
@@ -172,6 +187,11 @@ class Ended:
     picked: bool
     placed: bool
 
+    @property
+    def all_failed(self) -> int:
+        """The failed tries, and of a task in which no try picked up those that were left."""
+        return self.failed if self.picked else TRIES
+
 
 def transport(row: str, model: AnyPolicy | None, thing: Object, goal: Pose, rng: np.random.Generator) -> Any:
     arms = [Arms.LEFT, Arms.RIGHT]
@@ -199,120 +219,205 @@ async def performed(row: str, model: AnyPolicy | None, here: Kitchen, seed: int,
     return Ended(made, False, False, placed)
 
 
-async def ceiling(here: Kitchen, seed: int, number: int) -> tuple[bool, bool]:
-    """Return whether any of many ways picks the object up, and whether any does with which it can be placed."""
+def grid(at: Pose, turn: float) -> list[Pose]:
+    """Return the poses of the base around a point that are clear of obstacles, the usual distances first."""
+    steps = math.ceil(PLACES_M[1] / CELL_M)
+    cells = [(CELL_M * x, CELL_M * y) for x in range(-steps, steps + 1) for y in range(-steps, steps + 1)]
+    cells = [each for each in cells if PLACES_M[0] < math.hypot(*each) < PLACES_M[1]]
+    cells.sort(key=lambda each: abs(math.hypot(*each) - 0.65))
+    x, y, _ = at.position
+    poses = [face(Pose((x + dx, y + dy, 0.0)), at, height_m=base_height_m(), turned=turn) for dx, dy in cells]
+    clearance = base_clearance()
+    assert clearance is not None
+    return [each for each in poses if clearance.refusal(each) is None]
+
+
+def holds(thing: Object) -> Iterator[tuple[Arms, Grasp]]:
+    """Yield each arm and grasp with which the object can be picked up from a place of the grid."""
+    ways, around, heights = TransportPolicy(), grid(thing.pose, 0.0), torsos(thing)
+    for hold in product(require_robot().description.arms, Grasp):
+        tries = (MoveAndPickUpPerformable(each, designator_of(thing), *hold) for each in around)
+        if ways.takes(thing, *hold) and any(ways.reaches(each, torso) for each in tries for torso in heights):
+            yield hold
+
+
+def torsos(thing: Object) -> list[float | None]:
+    limits = context_of(thing).torso_limits
+    return [None] if limits is None else np.linspace(*limits, TORSOS).tolist()
+
+
+def solvable(here: Kitchen, seed: int, number: int) -> bool:
+    """Return whether any arm and grasp pick the object up from a place of the grid, and place it from another."""
     thing, goal = here.prepare(seed, number)
-    rng = np.random.default_rng((seed, number, 4))
-    ways = TransportPolicy(rng=rng)
-    picking = False
-    placing: dict[Any, bool] = {}
-    with suppress(PlanFailure):  # no place is free
-        action = MoveAndPickUp(thing, policy=SuccessModel.untrained(), rng=rng)
-        clearance = base_clearance()
-        assert clearance is not None
-        for choice in action.rated(CANDIDATES)[0]:
-            if action.is_clear(choice, clearance) and ways.reaches(action.way(choice)):
-                picking, key = True, choice[:2]
-                if key not in placing:
-                    placing[key] = any(ways.placing_chance(thing, *key, goal) for _ in range(TURNS))
-                if placing[key]:
-                    return True, True
-    return picking, False
+    robot, heights = require_robot(), torsos(thing)
+
+    def places(hold: tuple[Arms, Grasp], turn: float) -> bool:
+        at = goal @ Pose(orientation=GRASP_ORIENTATIONS[hold[1]])
+        goals = at, retract(at)
+        return any(
+            reaching_arms(robot, hold[0], base, lambda _: goals, torso_height=torso, grasps=False).refusal is None
+            for base in around[turn]
+            for torso in heights
+        )
+
+    able: list[tuple[Arms, Grasp]] = []
+    around = {0.0: grid(goal, 0.0)}
+    for hold in holds(thing):
+        able.append(hold)
+        if places(hold, 0.0):
+            return True
+    around = {turn: grid(goal, turn) for turn in TURNS} if able else {}
+    return any(places(hold, turn) for turn in around for hold in able)
 
 
-async def part(row: str, model_file: str | None, errors: Disturbance, seed: int, numbers: Sequence[int]) -> list[Any]:
-    model = load_policy(model_file) if model_file is not None else None
-    with kitchen(errors) as here:
-        if row == "ceiling":
-            return [await ceiling(here, seed, number) for number in numbers]
-        return [await performed(row, model, here, seed, number) for number in numbers]
+def job(row: str, model_file: str | None, errors: Disturbance, seed: int, numbers: Sequence[int]) -> list[Any]:
+    """Return how these tasks ended, of the row "ceiling" whether they can be solved; run in a process of its own."""
+
+    async def ended() -> list[Any]:
+        model = load_policy(model_file) if model_file is not None else None
+        with kitchen(errors) as here:
+            if row == "ceiling":
+                return [solvable(here, seed, number) for number in numbers]
+            return [await performed(row, model, here, seed, number) for number in numbers]
+
+    return asyncio.run(ended())
 
 
-def in_process(*arguments: Any) -> list[Any]:
-    return asyncio.run(part(*arguments))
+class Kept:
+    """The ends of tasks that were measured before, by row, errors, seed and number, in a file of JSON lines."""
+
+    def __init__(self, file: Path | None) -> None:
+        self._file = file
+        self._ends: dict[tuple[Any, ...], Any] = {}
+        if file is not None and file.exists():
+            for line in file.read_text().splitlines():
+                with suppress(ValueError):  # the last line of a run that was killed
+                    *key, end = json.loads(line)
+                    self._ends[tuple(key)] = end
+
+    def of(self, key: tuple[Any, ...], number: int) -> Any:
+        end = self._ends.get((*key, number))
+        return Ended(**end) if isinstance(end, dict) else end
+
+    def solved(self, seed: int) -> set[int]:
+        """Return the tasks in which a row without errors placed the object."""
+        return {
+            number
+            for (_, errors, _, own_seed, number), end in self._ends.items()
+            if isinstance(end, dict) and end["placed"] and not errors and own_seed == seed
+        }
+
+    def add(self, key: tuple[Any, ...], numbers: Sequence[int], ends: Sequence[Any]) -> None:
+        for number, end in zip(numbers, ends, strict=True):
+            self._ends[(*key, number)] = plain = asdict(end) if isinstance(end, Ended) else end
+            if self._file is not None:
+                with self._file.open("a") as file:
+                    file.write(json.dumps([*key, number, plain]) + "\n")
 
 
-def measure(row: str, model_file: str | None, errors: Disturbance, seed: int, tasks: int, workers: int) -> list[Any]:
-    """Return how each task ended; the same for any number of workers."""
-    parts = [range(first, tasks, workers) for first in range(workers)]
+def measure(
+    kept: Kept,
+    row: str,
+    model_file: str | None,
+    errors: Disturbance,
+    seed: int,
+    numbers: Sequence[int],
+    workers: int,
+) -> list[Any]:
+    """Return how each of these tasks ended; the same for any number of workers."""
+    key = row, str(errors), Path(model_file).name if model_file is not None else "", seed
+    missing = [number for number in numbers if kept.of(key, number) is None]
     with ProcessPoolExecutor(workers, mp_context=get_context("forkserver")) as pool:
-        results = list(
-            pool.map(in_process, *zip(*((row, model_file, errors, seed, each) for each in parts), strict=True))
-        )
-    ended: list[Any] = [None] * tasks
-    for numbers, some in zip(parts, results, strict=True):
-        for number, each in zip(numbers, some, strict=True):
-            ended[number] = each
-    return ended
+        running = {
+            pool.submit(job, row, model_file, errors, seed, some): some
+            for some in (missing[first : first + BATCH] for first in range(0, len(missing), BATCH))
+        }
+        left = len(missing)
+        for each in as_completed(running):
+            kept.add(key, running[each], each.result())
+            left -= len(running[each])
+            done = f"{len(numbers) - left} of {len(numbers)} tasks"
+            print(f"{row}, {str(errors) or 'no errors'}: {done}", file=sys.stderr, flush=True)
+    return [kept.of(key, number) for number in numbers]
 
 
-def figures_of(ended: Sequence[Ended]) -> dict[str, Any]:
-    shares = {
-        name: (sum(flags), [round(each, 3) for each in interval_95(sum(flags), len(flags))])
-        for name, flags in (
-            ("first_try", [each.first for each in ended]),
-            ("picked", [each.picked for each in ended]),
-            ("placed", [each.placed for each in ended]),
-        )
+def share(flags: Sequence[bool]) -> list[float]:
+    """Return the share of true flags and its interval of 95 %."""
+    count = sum(flags)
+    return [round(each, 3) for each in (count / len(flags), *interval_95(count, len(flags)))]
+
+
+def figures_of(ended: Sequence[Ended], solvable: Sequence[bool]) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "first_try": share([each.first for each in ended]),
+        "picked": share([each.picked for each in ended]),
+        "placed": share([each.placed for each in ended]),
+        "failed_per_100": round(100 * sum(each.failed for each in ended) / len(ended), 1),
+        "all_tries_per_100": round(100 * sum(each.all_failed for each in ended) / len(ended), 1),
     }
-    figures: dict[str, Any] = {name: [round(done / len(ended), 3), *limits] for name, (done, limits) in shares.items()}
-    failed = sum(each.failed for each in ended)
-    left = sum(TRIES - each.failed for each in ended if not each.picked)
-    return figures | {
-        "failed_per_100": round(100 * failed / len(ended), 1),
-        "with_tries_left": round(100 * (failed + left) / len(ended), 1),
-    }
+    if any(solvable):
+        able = [each for each, flag in zip(ended, solvable, strict=True) if flag]
+        figures["placed_of_solvable"] = share([each.placed for each in able])
+        figures["all_tries_per_100_solvable"] = round(100 * sum(each.all_failed for each in able) / len(able), 1)
+    return figures
 
 
 def show(figures: dict[str, Any]) -> None:
-    table = Table("errors", "row", "first try", "picked in 5", "placed", "failed tries per 100", "tries left counted")
+    names = "first_try", "picked", "placed", "placed_of_solvable"
+    counts = "failed_per_100", "all_tries_per_100", "all_tries_per_100_solvable"
+    headings = "first try", "picked in 5", "placed", "placed of solvable"
+    table = Table("errors", "row", *headings, "failed tries per 100", "all tries", "all, per 100 solvable")
     for each in figures["rows"]:
-        shares = ("{:.1%} ({:.0%}-{:.0%})".format(*each[name]) for name in ("first_try", "picked", "placed"))
-        counts = (str(each[name]) for name in ("failed_per_100", "with_tries_left"))
-        table.add_row(each["errors"], each["row"], *shares, *counts)
-    for each in figures["ceilings"]:
-        shares = ("{:.1%} ({:.0%}-{:.0%})".format(*each[name]) for name in ("picked", "placed"))
-        table.add_row("none", "ceiling", "", *shares, "", "")
-    Console(stderr=True, width=140).print(table)
+        shares = ["{:.0%} ({:.0%}-{:.0%})".format(*each[name]) if name in each else "" for name in names]
+        table.add_row(each["errors"], each["row"], *shares, *(str(each.get(name, "")) for name in counts))
+    table.caption = "{:.1%} ({:.1%}-{:.1%}) of the tasks can be solved".format(*figures["solvable"])
+    if figures["not_solvable"]:
+        table.caption += "; not solvable: " + ", ".join(map(str, figures["not_solvable"]))
+    Console(stderr=True, width=160).print(table)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few tasks, and a model of a few rollouts")
-    parser.add_argument("--tasks", type=int, default=200)
+    parser.add_argument("--tasks", type=int, default=60)
     parser.add_argument("--seed", type=int, default=69)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--only", choices=(*ROWS, "ceiling"))
+    parser.add_argument("--only", choices=(*ROWS, "ceiling"), help="one row")
     parser.add_argument("--errors", choices=("none", "all"), help="without or with errors of the robot; default both")
+    parser.add_argument("--rollouts", type=int, default=ROLLOUTS, help=f"pick-ups of a round; default {ROLLOUTS}")
     parser.add_argument("--models", type=Path, help="folder in which models are kept, to be used again")
+    parser.add_argument("--kept", type=Path, help="file of ended tasks: a further run with it continues; of this code")
     arguments = parser.parse_args()
-    tasks, rollouts = (6, 200) if arguments.quick else (arguments.tasks, ROLLOUTS)
+    tasks, rollouts = (6, 200) if arguments.quick else (arguments.tasks, arguments.rollouts)
+    if min(tasks, rollouts, arguments.workers) < 1:
+        parser.error("--tasks, --rollouts and --workers must be 1 or more")
     rows = [row for row in ROWS if arguments.only in (None, row)]
-    figures: dict[str, Any] = {"bench": "tasks", "tasks": tasks, "seed": arguments.seed, "rows": [], "ceilings": []}
+    figures: dict[str, Any] = {"bench": "tasks", "tasks": tasks, "seed": arguments.seed, "rows": []}
+    kept = Kept(arguments.kept)
+    ends: dict[tuple[str, str], list[Ended]] = {}
     with tempfile.TemporaryDirectory(prefix="tasks_") as temporary:
         folder = arguments.models or Path(temporary)
-        if arguments.only in (None, "ceiling"):
-            reached = measure("ceiling", None, Disturbance(), arguments.seed, tasks, arguments.workers)
-            figures["ceilings"].append(
-                {
-                    name: [round(sum(flags) / tasks, 3), *interval_95(sum(flags), tasks)]
-                    for name, flags in zip(("picked", "placed"), zip(*reached, strict=True), strict=True)
-                }
-            )
+        folder.mkdir(parents=True, exist_ok=True)
         for name, errors in (("none", Disturbance()), ("all", ERRORS)):
-            if arguments.errors not in (None, name):
+            if arguments.errors not in (None, name) or not rows:
                 continue
             file = folder / f"tasks_{name}_{rollouts}.json"
             if any(row.startswith("model") for row in rows) and not file.exists():
+                print(f"learning from {ROUNDS * rollouts} pick-ups, errors: {name}", file=sys.stderr, flush=True)
                 model = asyncio.run(learned(replace(LEARNING, disturbance=errors), 1_000, rollouts=rollouts))
                 save_policy(model, file)
             for row in rows:
                 used = str(file) if row.startswith("model") else None
-                began = time.monotonic()
-                ended = measure(row, used, errors, arguments.seed, tasks, arguments.workers)
-                seconds = round((time.monotonic() - began) / tasks, 3)
-                figures["rows"].append({"errors": name, "row": row, **figures_of(ended), "seconds_per_task": seconds})
-                show({**figures, "rows": figures["rows"][-1:], "ceilings": []})
+                ends[name, row] = measure(kept, row, used, errors, arguments.seed, range(tasks), arguments.workers)
+    able = kept.solved(arguments.seed)
+    rest = [number for number in range(tasks) if number not in able]
+    searched = measure(kept, "ceiling", None, Disturbance(), arguments.seed, rest, arguments.workers)
+    able |= {*compress(rest, searched)}
+    figures["not_solvable"] = [number for number in rest if number not in able]
+    flags = [number in able for number in range(tasks)]
+    figures["solvable"] = share(flags)
+    for (name, row), ended in ends.items():
+        figures["rows"].append({"errors": name, "row": row, **figures_of(ended, flags)})
     show(figures)
     print(json.dumps(figures))
 

@@ -39,6 +39,7 @@ from pycrorm_async.plan.failures import ObjectUnreachable, Resource
 from pycrorm_async.plan.geometry import lifting_arms
 from pycrorm_async.plan.language import ActionDescription
 from pycrorm_async.plan.locations import BaseClearance, base_clearance, base_height_m, face
+from pycrorm_async.plan.motions import collisions_count
 from pycrorm_async.plan.task import Experience, PastSuccess, experience
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.bounding_boxes import box_around
@@ -520,7 +521,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def _clear_choices(
         self, draw: Callable[[int], list[PickUpChoice]], count: int, *, every: bool = False
     ) -> Sequence[PickUpChoice]:
-        """Draw `count` ways; where collisions count, only those where the base is clear before and after it turns.
+        """Draw `count` ways; where collisions count, only those where the base is clear.
 
         With `every`, `draw` may return fewer than it is asked for. Raises `ObjectUnreachable` if none of `_DRAWS_MAX`
         times as many is possible.
@@ -542,15 +543,14 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return ObjectUnreachable(message, self.target.name)
 
     def is_clear(self, choice: PickUpChoice, clearance: BaseClearance) -> bool:
-        """Return whether the base is clear of obstacles at its place, before and after it turns to the object."""
-        place = self.chosen(choice).standing_position
-        facing = face(place, self.target.pose, height_m=place.position.z)
-        return clearance.refusal(place) is None and clearance.refusal(facing) is None
+        """Return whether the base is clear of obstacles at its place, where it faces the object."""
+        return clearance.refusal(self.chosen(choice).standing_position) is None
 
     def chosen(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
         """Return the action for this choice and the object's current pose.
 
-        The base's position is above the point of the floor that has these x and y in the object's own frame. Raises
+        The base's position is above the point of the floor that has these x and y in the object's own frame. Where
+        collisions count it faces the object on arrival, because turning there takes more room. Raises
         `ObjectUnreachable` for an object that lies on its side, whose x-y plane does not map to the floor.
         """
         pose = self.target.pose
@@ -560,6 +560,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             raise ObjectUnreachable(message, self.target.name)
         x, y, z = (pose @ Pose((choice.relative_x, choice.relative_y, 0.0))).position
         standing_position = Pose((x - z * up.x / up.z, y - z * up.y / up.z, base_height_m()))
+        if collisions_count():
+            standing_position = face(standing_position, pose, height_m=base_height_m())
         return MoveAndPickUpPerformable(
             standing_position, self.target, choice.arm, choice.grasp, policy=self.policy_name
         )

@@ -10,6 +10,9 @@ as the best way to place with its arm and grasp is less likely.
 What experience prefers is checked before it is tried, as `CostmapLocation` checks its places: a way whose goals the arm
 does not reach, or where collisions count reaches only in collision, is left out. What the check cannot foresee, such as
 errors of base and perception, only experience does.
+
+The ways are all combinations of arm, grasp, a place of the base on a grid within reach, and a few heights of the torso.
+Drawn at random, as many ways miss most of the tasks that have few solutions, such as those at high tables.
 """
 
 from __future__ import annotations
@@ -19,26 +22,42 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
+from itertools import compress, product
+from typing import NamedTuple
 
 import numpy as np
 
 from pycrorm_async.errors import ImpossibleCondition
 from pycrorm_async.learning.features import PickUpContext
-from pycrorm_async.learning.move_and_pick_up import PROPOSALS, MoveAndPickUp, RecalledPickUp, context_of
-from pycrorm_async.learning.policy import Evidence, Floats, PickUpChoice, Policy, default_policy
+from pycrorm_async.learning.move_and_pick_up import (
+    HEIGHT_TOLERANCE_M,
+    PROPOSALS,
+    MoveAndPickUp,
+    RecalledPickUp,
+    context_of,
+    free_and_visible,
+)
+from pycrorm_async.learning.policy import Evidence, Floats, PickUpChoice, Policy
 from pycrorm_async.learning.policy_file import AnyPolicy
 from pycrorm_async.learning.success_model import SuccessModel
 from pycrorm_async.plan import failures, geometry, locations, objects
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.execution import Refusal
 from pycrorm_async.plan.motions import collisions_count
+from pycrorm_async.world.bullet import Object
+from pycrorm_async.world.kinematics import chain_of
 from pycrorm_async.world.pose import Arms, Grasp, Pose, dot
 from pycrorm_async.world.queries import OccupancyCostmap
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS
 
-CHECKED_MAX = 200
-"""Bounds the places that are checked to find out whether an arm and a grasp can place an object at all."""
+CELL_M = 0.06
+"""The distance in m of two places that are searched; each search shifts its places at random."""
+TORSOS = 5
+"""The heights of the torso that are searched, its limits included: the highest tables need the highest torso."""
+FETCHING_SEARCHES, PLACING_SEARCHES = 2, 4
+"""The searches that follow one another until a way is possible."""
+_TURN_RAD = math.pi / 2
+"""The greatest angle between the goal and the robot's heading in all searches for placing but the first."""
 _ALIKE_M = 0.1
 """The distance in m, of the base and of the torso, at which two ways with the same arm and grasp are half alike."""
 
@@ -47,12 +66,12 @@ class TransportPolicy:
     """The ways to fetch and to place objects that experience prefers, for `TransportAction(…, policy=)`.
 
     Args:
-        policy: a success model or a learned policy; None prefers nothing: random places and heights of the torso.
+        policy: a success model or a learned policy; None prefers nothing: the first possible way, in random order.
         recall: fetch first in the ways that succeeded before, by the open memory, then in those of the policy
             (`RecalledPickUp`).
         checked: leave out ways that kinematics, or where collisions count a collision, forbids. Without it the
             experience alone decides.
-        rng: random generator of the proposals; None means a new one with an unpredictable seed.
+        rng: random generator of the order and the shift of the places; None means a new one with an unpredictable seed.
     """
 
     def __init__(
@@ -75,41 +94,57 @@ class TransportPolicy:
     ) -> AsyncIterator[MoveAndPickUpPerformable]:
         """Iterate over ways to pick up the object so that it can be placed at the goal, the likeliest first.
 
-        After a failure, ways like the failed one count less. Raises `ObjectUnreachable` if there is no free place.
+        After a failure, ways like the failed one count less.
         """
+        places = self.places(target, goal)
 
         @cache
         def placeable(arm: Arms, grasp: Grasp) -> float:
-            return self.placing_chance(target, arm, grasp, goal)
+            return places.chance(arm, grasp)
+
+        @cache
+        def takes(arm: Arms, grasp: Grasp) -> bool:
+            return self.takes(target, arm, grasp)
 
         if self._recalls:
             otherwise = self.policy if self.policy != SuccessModel.untrained() else None
             async for way in RecalledPickUp(target, arms, policy=otherwise, samples=PROPOSALS, rng=self._rng):
-                if placeable(way.arm, way.grasp) and self.reaches(way):
+                hold = way.arm, way.grasp
+                if takes(*hold) and self.reaches(way, getattr(way, "torso", None)) and placeable(*hold):
                     yield way
             return
         action = MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
         action.keep_policy()
-        choices, chances = action.rated(PROPOSALS)
-        clearance = locations.base_clearance()
-        weighed: set[tuple[Arms, Grasp]] = set()
-        while chances.any():
-            best = int(chances.argmax())
-            choice = choices[best]
-            hold = choice.arm, choice.grasp
-            if hold not in weighed:  # until then its chance is too high, so that no better one is missed
-                weighed.add(hold)
-                chances = chances * np.where([each[:2] == hold for each in choices], placeable(*hold), 1.0)
-                continue
-            chances[best] = 0.0
-            if clearance is not None and not action.is_clear(choice, clearance):
-                continue
-            if self.reaches(way := action.way(choice)):
-                yield way
-                chances *= 1 - _alike(choice, choices) / 2
+        obj = objects.in_world(target)
+        region, context = free_and_visible(objects.require_robot(), obj), context_of(obj)
+        holds = [hold for hold in product(arms, Grasp) if takes(*hold)]
+        weights: dict[int, float] = {}
+        tried: list[PickUpChoice] = []
+        for _ in range(FETCHING_SEARCHES if holds else 0):
+            stands = self.stands(obj.pose)
+            seeing = region.contains(*np.array([each[:2] for each in stands]).reshape(-1, 2).T)
+            stands = [*compress(stands, seeing)]
+            choices = self.choices(stands, holds, context)
+            hold_of = np.arange(len(choices)) % len(holds)
+            chances = self.chances(choices, context) * np.array([weights.get(each, 1.0) for each in hold_of.tolist()])
+            for each in tried:
+                chances *= 1 - _alike(each, choices) / 2
+            while chances.any():
+                best = int(chances.argmax())
+                choice, number = choices[best], int(hold_of[best])
+                if not self.reaches(action.chosen(choice), choice.torso):
+                    chances[best] = 0.0
+                elif number not in weights:  # until then its chance is too high, so that no better one is missed
+                    weights[number] = placeable(*holds[number])
+                    chances[hold_of == number] *= weights[number]
+                else:
+                    chances[best] = 0.0
+                    yield action.way(choice)
+                    tried.append(choice)
+                    chances *= 1 - _alike(choice, choices) / 2
 
-    def reaches(self, way: MoveAndPickUpPerformable) -> bool:
-        """Return whether the arm, parked before, reaches all goals of the pick-up."""
+    def reaches(self, way: MoveAndPickUpPerformable, torso: float | None = None) -> bool:
+        """Return whether the arm, parked before, reaches all goals of the pick-up with the torso at this height, m."""
         if not self.is_checked:
             return True
         robot, target = objects.require_robot(), objects.in_world(way.object_designator)
@@ -118,15 +153,21 @@ class TransportPolicy:
         tool_link = robot.body.link_pose_at(described.tool_frame, described.park)
         tool = base @ objects.in_link(tool_link, described.tool_in_link).relative_to(robot.body.pose)
         goals = geometry.pick_up_poses(target.pose, way.grasp, tool)
-        try:
-            geometry.check_takable(robot, way.arm, target)
-            if collisions_count():
-                geometry.check_fits(robot, way.arm, target, goals.at.orientation)
-        except failures.PlanFailure:
-            return False
-        torso = getattr(way, "torso", None)
         reach = locations.reaching_arms(robot, way.arm, base, lambda _: goals, torso_height=torso, grasps=True)
         return reach.refusal is None
+
+    def takes(self, target: objects.ObjectLike, arm: Arms, grasp: Grasp) -> bool:
+        """Return whether the gripper can take the object in this grasp."""
+        if not self.is_checked:
+            return True
+        robot, obj = objects.require_robot(), objects.in_world(target)
+        try:
+            geometry.check_takable(robot, arm, obj)
+            if collisions_count():
+                geometry.check_fits(robot, arm, obj, geometry.grasp_orientation(obj.pose, grasp))
+        except failures.PlanFailure:
+            return False
+        return True
 
     # --- placing ----------------------------------------------------------------------------------------------
 
@@ -134,68 +175,124 @@ class TransportPolicy:
         """Return the places, with heights of the torso, from which the arm places the held object, likeliest first."""
         return PlacingLocation(goal, objects.designator_of(held), arm, self)
 
-    def placing_chance(self, target: objects.ObjectLike, arm: Arms, grasp: Grasp, goal: Pose) -> float:
-        """Return the chance to place the object at the goal with this arm and grasp; 0 if no place is found."""
-        for place, chance in islice(self.placing_places(target, arm, grasp, goal), CHECKED_MAX):
+    def places(self, target: objects.ObjectLike, goal: Pose) -> Places:
+        """Return the places from which the object can be placed at the goal, to be asked for several grasps."""
+        return Places(self, objects.in_world(target), goal)
+
+    # --- searching --------------------------------------------------------------------------------------------
+
+    def stands(self, at: Pose, *, turned: bool = False) -> list[Stand]:
+        """Return the places within reach of a pose, in random order, at which the base is clear of obstacles.
+
+        The base faces the pose, or is turned from that by a random angle. Without collisions, places may be occupied.
+        """
+        robot, clearance, height_m = objects.require_robot(), locations.base_clearance(), locations.base_height_m()
+        steps = math.ceil((reach_m := _reach_m(robot)) / CELL_M)
+        axis = np.arange(-steps, steps + 1) * CELL_M
+        places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + self._rng.uniform(0, CELL_M, 2)
+        places = self._rng.permutation(places[np.hypot(*places.T) <= reach_m])
+        turns = self._rng.uniform(-_TURN_RAD, _TURN_RAD, len(places)) * turned
+        cos, sin, (x, y, _) = math.cos(at.yaw), math.sin(at.yaw), at.position
+        stands = []
+        for (ahead, aside), turn in zip(places.tolist(), turns.tolist(), strict=True):
+            place = Pose((x + cos * ahead - sin * aside, y + sin * ahead + cos * aside, 0.0))
+            base = locations.face(place, at, height_m=height_m, turned=turn)
+            if clearance is None or clearance.refusal(base) is None:
+                stands.append(Stand(ahead, aside, base))
+        return stands
+
+    def choices(
+        self, stands: Sequence[Stand], holds: Sequence[tuple[Arms, Grasp]], context: PickUpContext
+    ) -> list[PickUpChoice]:
+        """Return each combination; the arm and the grasp change first, then the height of the torso."""
+        torsos: list[float | None] = [None]
+        if context.torso_limits is not None and not isinstance(self.policy, Policy):
+            torsos = np.linspace(*context.torso_limits, TORSOS).tolist()
+        return [
+            PickUpChoice(arm, grasp, x, y, torso=torso)
+            for x, y, _ in stands
+            for torso in torsos
+            for arm, grasp in holds
+        ]
+
+    def chances(self, choices: Sequence[PickUpChoice], context: PickUpContext) -> Floats:
+        """Return the chance of each choice: a model's probability, of a policy its density relative to the highest.
+
+        Where there is no preference the chances are 1, less too little to matter but for their order, which is random.
+        """
+        if isinstance(self.policy, SuccessModel) and self.policy.trees:
+            return self.policy.probability(choices, context)
+        rated = np.asarray(1 - 1e-9 * self._rng.random(len(choices)))
+        if isinstance(self.policy, SuccessModel):
+            return rated
+        if choices:
+            with suppress(ImpossibleCondition):
+                if isinstance(self.policy, Policy):
+                    height = context.height - context.torso
+                    near = Evidence(height=(height - HEIGHT_TOLERANCE_M, height + HEIGHT_TOLERANCE_M))
+                    density = self.policy.condition(near).likelihood(choices)
+                else:
+                    density = self.policy.likelihood(choices, context)
+                if density.any():
+                    rated = density / density.max()
+        return rated
+
+
+class Stand(NamedTuple):
+    """A place of the base: x and y in the upright frame of the pose to be reached, m, and the base's pose."""
+
+    x: float
+    y: float
+    base: Pose
+
+
+class Places:
+    """The free places around a goal, searched once for all arms and grasps with which an object may be placed there."""
+
+    def __init__(self, ways: TransportPolicy, target: Object, goal: Pose) -> None:
+        self._ways, self._target, self._goal = ways, target, goal
+        self._context = context_of(target, at=goal)
+        self._searches: list[list[Stand]] = []
+
+    def chance(self, arm: Arms, grasp: Grasp) -> float:
+        """Return the chance to place the object with this arm and grasp; 0 if no place is found."""
+        for place, chance in self.of(arm, grasp):
             if isinstance(place, locations.Location):
                 return chance
         return 0.0
 
-    def placing_places(
-        self, target: objects.ObjectLike, arm: Arms, grasp: Grasp, goal: Pose
-    ) -> Iterator[tuple[locations.Location | Refusal, float]]:
-        """Yield places around the goal that are free, the likeliest first, each with its chance or its refusal."""
-        robot, obj = objects.require_robot(), objects.in_world(target)
-        context, tool = context_of(obj, at=goal), Pose(orientation=GRASP_ORIENTATIONS[grasp])
-        if robot.body.attachments.get(obj) == robot.one_arm(arm).tool_frame:
-            tool = robot.tool_pose(arm).relative_to(obj.pose)
-        goals = goal @ tool, geometry.retract(goal @ tool)
-        choices = self._proposals(robot, arm, grasp, goal, context)
-        chances = self._chances(choices, context)
-        clearance, height_m = locations.base_clearance(), locations.base_height_m()
-        for number in np.argsort(-chances, kind="stable").tolist():
-            choice, chance = choices[number], float(chances[number])
-            base = locations.face(_place(goal, choice), goal, height_m=height_m)
-            refusal = clearance.refusal(base) if clearance is not None else None
-            if refusal is None and self.is_checked:
-                refusal = locations.reaching_arms(
-                    robot, arm, base, lambda _: goals, torso_height=choice.torso, grasps=False
-                ).refusal
-            if refusal is not None:
-                yield Refusal(base, refusal), chance
-            else:
-                yield locations.Location(base, (arm,), grasp, choice.torso), chance
+    def of(self, arm: Arms, grasp: Grasp) -> Iterator[tuple[locations.Location | Refusal, float]]:
+        """Yield the places for this arm and grasp, the likeliest of a search first, each with its chance or refusal."""
+        robot = objects.require_robot()
+        tool = Pose(orientation=GRASP_ORIENTATIONS[grasp])
+        if robot.body.attachments.get(self._target) == robot.one_arm(arm).tool_frame:
+            tool = robot.tool_pose(arm).relative_to(self._target.pose)
+        goals = self._goal @ tool, geometry.retract(self._goal @ tool)
+        for number in range(PLACING_SEARCHES):
+            stands = self._search(number)
+            choices = self._ways.choices(stands, [(arm, grasp)], self._context)
+            chances = self._ways.chances(choices, self._context)
+            for at in np.argsort(-chances, kind="stable").tolist():
+                base, torso, chance = stands[at * len(stands) // len(choices)].base, choices[at].torso, chances[at]
+                reach = locations.PlaceReach((arm,))
+                if self._ways.is_checked:
+                    reach = locations.reaching_arms(robot, arm, base, lambda _: goals, torso_height=torso, grasps=False)
+                if reach.refusal is not None:
+                    yield Refusal(base, reach.refusal), float(chance)
+                else:
+                    yield locations.Location(base, (arm,), grasp, torso), float(chance)
 
-    def _proposals(
-        self, robot: objects.CurrentRobot, arm: Arms, grasp: Grasp, goal: Pose, context: PickUpContext
-    ) -> Sequence[PickUpChoice]:
-        """Return choices of the default policy around the goal, at free places, each with a height of the torso."""
-        ground = Pose((goal.position.x, goal.position.y, 0.0))
-        clearance = locations.base_clearance()
-        free = (
-            clearance.costmap(ground)
-            if clearance is not None
-            else OccupancyCostmap(objects.require_world(), ground, ignore=robot.with_load())
-        )
-        evidence = Evidence(frozenset({arm}), frozenset({grasp}))
-        drawn = default_policy().condition(evidence).sample(self._rng, 2 * PROPOSALS)
-        choices = [each for each in drawn if free.value_at(*_place(goal, each).position[:2]) > 0][:PROPOSALS]
-        return MoveAndPickUp.lifted(choices, self._rng, context)
-
-    def _chances(self, choices: Sequence[PickUpChoice], context: PickUpContext) -> Floats:
-        """Return the chance of each choice: a model's probability, of a policy its density relative to the highest."""
-        rated = np.ones(len(choices))
-        if isinstance(self.policy, SuccessModel):
-            return self.policy.probability(choices, context)
-        if choices:
-            with suppress(ImpossibleCondition):
-                density = (
-                    self.policy.likelihood(choices) if isinstance(self.policy, Policy)
-                    else self.policy.likelihood(choices, context)
-                )  # fmt: skip
-                if density.any():
-                    rated = density / density.max()
-        return rated
+    def _search(self, number: int) -> list[Stand]:
+        """Return the places of this search; where collisions do not count, those 0.32 m clear of obstacles."""
+        if len(self._searches) == number:
+            stands = self._ways.stands(self._goal, turned=number > 0)
+            if not collisions_count():
+                ground = Pose((self._goal.position.x, self._goal.position.y, 0.0))
+                ignored = objects.require_robot().with_load()
+                free = OccupancyCostmap(objects.require_world(), ground, ignore=ignored)
+                stands = [each for each in stands if free.value_at(*each.base.position[:2]) > 0]
+            self._searches.append(stands)
+        return self._searches[number]
 
 
 @dataclass(frozen=True)
@@ -212,7 +309,7 @@ class PlacingLocation(locations.LocationDesignator):
 
     def _candidates(self) -> Iterator[locations.Location | Refusal]:
         grasp = held_grasp(objects.require_robot(), self.arm, self.held)
-        for place, _ in self.policy.placing_places(self.held, self.arm, grasp, self.goal):
+        for place, _ in self.policy.places(self.held, self.goal).of(self.arm, grasp):
             yield place
 
     def _no_place_failure(self) -> failures.PlanFailure:
@@ -226,15 +323,19 @@ def held_grasp(robot: objects.CurrentRobot, arm: Arms, held: objects.ObjectLike)
     return max(Grasp, key=lambda grasp: abs(dot(hand, GRASP_ORIENTATIONS[grasp])))
 
 
-def _place(goal: Pose, choice: PickUpChoice) -> Pose:
-    """Return the point of the floor that has these x and y in an upright frame with the goal's heading."""
-    x, y = choice.relative_x, choice.relative_y
-    cos, sin = math.cos(goal.yaw), math.sin(goal.yaw)
-    return Pose((goal.position.x + cos * x - sin * y, goal.position.y + sin * x + cos * y, 0.0))
+def _reach_m(robot: objects.CurrentRobot) -> float:
+    """Return the greatest distance along the floor from the base to a point that an arm reaches."""
+    reaches = []
+    for arm, described in robot.description.arms.items():
+        shoulder = robot.body.link_pose(robot.body.model.joints[described.joints[0]].child)
+        reaches.append(
+            chain_of(robot.body, arm).reach_m + math.hypot(*shoulder.relative_to(robot.body.pose).position[:2])
+        )
+    return max(reaches)
 
 
 def _alike(one: PickUpChoice, choices: Sequence[PickUpChoice]) -> Floats:
     """Return how alike each choice is to one: 1 to 0, a half at a distance of `_ALIKE_M`; 0 for another grasp."""
     same = np.array([each[:2] == one[:2] for each in choices])
-    at = np.array([(*each[2:4], each.torso or 0.0) for each in choices])
-    return np.asarray(same * 0.5 ** (((at - at[choices.index(one)]) ** 2).sum(axis=1) / _ALIKE_M**2))
+    off = [math.dist((*each[2:4], each.torso or 0.0), (*one[2:4], one.torso or 0.0)) for each in choices]
+    return np.asarray(same * 0.5 ** (np.array(off) / _ALIKE_M) ** 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -167,3 +168,10 @@ def test_an_impossible_scene_is_refused() -> None:
         Scene(heights=(1.2, 0.6))
     with pytest.raises(CallerError, match="a table or the kitchen, not both"):
         Scene(table=True, kitchen=True)
+
+
+def test_a_robot_arrives_facing_the_object_where_collisions_count() -> None:
+    for collisions, ahead in ((True, -1.0), (False, 1.0)):
+        with Scene(collisions=collisions).entered() as stage:
+            there = MoveAndPickUp(stage.target).chosen(PickUpChoice(Arms.LEFT, Grasp.FRONT, 0.6, 0.0))
+            assert math.cos(there.standing_position.yaw) == pytest.approx(ahead)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from bench import tasks
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning import Disturbance, SuccessModel, TransportPolicy, name_of
+from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable
 from pycrorm_async.learning.transport import held_grasp
 from pycrorm_async.orm import TransportAction as TransportRow
 from pycrorm_async.plan import (
@@ -24,10 +26,11 @@ from pycrorm_async.plan import (
     TransportAction,
 )
 from pycrorm_async.plan.failures import ReachabilityFailure
+from pycrorm_async.plan.locations import Location, face
 from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world import Arms, Pose
+from pycrorm_async.world import Arms, Grasp, Pose
 
 pytestmark = pytest.mark.slow
 
@@ -59,7 +62,7 @@ async def test_what_is_picked_up_is_placed_and_nothing_fails_on_the_way(tmp_path
 
 async def test_a_task_ends_the_same_in_any_order_and_world() -> None:
     def ends(numbers: list[int]) -> dict[int, Any]:
-        return dict(zip(numbers, tasks.in_process("random, checked", None, tasks.ERRORS, 69, numbers), strict=True))
+        return dict(zip(numbers, tasks.job("random, checked", None, tasks.ERRORS, 69, numbers), strict=True))
 
     forth, back = [await asyncio.to_thread(ends, each) for each in ([0, 4], [4, 0])]
     assert forth == back
@@ -83,6 +86,26 @@ async def test_the_next_try_delivers_what_is_held_from_another_place() -> None:
                 break
         assert len(places) > 1
         assert len(set(places)) == len(places)
+
+
+async def test_the_only_place_is_found_with_the_torso_at_its_limit() -> None:
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 1)  # cereal at 1.14 m, which the gripper takes from the front and from above
+        way = await anext(policy(1).fetching(thing, ARMS, goal))
+        assert isinstance(way, PredictedPickUpPerformable)
+        assert (way.grasp, way.torso) == (Grasp.FRONT, 0.33)
+        await way.perform()
+        assert thing in here.robot.attachments
+
+
+async def test_the_base_is_turned_where_no_place_facing_the_goal_serves() -> None:
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 20)
+        ways = TransportPolicy(rng=np.random.default_rng((69, 20, 5)))
+        places = ways.places(thing, goal).of(Arms.LEFT, Grasp.RIGHT)
+        place = next(each for each, _ in places if isinstance(each, Location))
+        facing = face(place.pose, goal, height_m=0.0)
+        assert abs(math.remainder(place.pose.yaw - facing.yaw, math.tau)) > 0.1
 
 
 async def test_a_policy_is_asked_with_async_for_and_says_so() -> None:
