@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -127,15 +127,20 @@ class Situation(NamedTuple):
     model: str | None = None
 
 
-def predict(library: CaseLibrary, situations: Iterable[Situation], unlike: Collection[int] = ()) -> list[Prediction]:
-    """Predict the outcome of an action in each of these situations; tries in the episodes `unlike` do not count."""
-    left_out = np.array(sorted(unlike), np.int64)
+def predict(
+    library: CaseLibrary, situations: Iterable[Situation], left_out: Sequence[tuple[int, int]] = ()
+) -> list[Prediction]:
+    """Predict the outcome of an action in each of these situations.
+
+    Tries whose node id is in a range of `left_out`, from its first id up to before its end, do not count.
+    """
+    bounds = np.sort(np.array(left_out, np.int64).reshape(-1, 2), axis=0)
     tries: dict[tuple[str, frozenset[tuple[str, str]]], _Tries] = {}
     predictions = []
     for each in situations:
         key = each.type, frozenset(each.words.items())
         if key not in tries:
-            tries[key] = _Tries.of(library, each.type, each.words, left_out)
+            tries[key] = _Tries.of(library, each.type, each.words, bounds)
         predictions.append(tries[key].prediction(each, library))
     return predictions
 
@@ -151,11 +156,11 @@ class _Tries:
         self._prior = (successes + 1) / (count + 2)
 
     @classmethod
-    def of(cls, library: CaseLibrary, type_: str, words: Mapping[str, str], left_out: NDArray[np.int64]) -> _Tries:
+    def of(cls, library: CaseLibrary, type_: str, words: Mapping[str, str], bounds: NDArray[np.int64]) -> _Tries:
         chosen, successes, count = [], 0, 0
         of_object = {name: words[name] for name in ("object_type", "robot") if name in words}
         for group in library.groups(type_):
-            ended = _ended(group) & ~np.isin(group.episodes, left_out)
+            ended = _ended(group) & ~_within(bounds, group.nodes)
             like = ended & _having(group, of_object)
             successes += int((like & group.texts["status"].having("SUCCEEDED")).sum())
             count += int(like.sum())
@@ -179,6 +184,12 @@ class _Tries:
         source = (situation.model or "a model") if of_model else "recall"
         note = None if library.size(situation.type) else never_seen(situation.type, library)
         return Prediction(chance, min(low, chance), max(high, chance), evidence, cases, reason, source, note)
+
+
+def _within(bounds: NDArray[np.int64], nodes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which nodes are in a range: there more of the sorted first ids have come than ends, shape (ranges, 2)."""
+    begun, ended = (np.searchsorted(each, nodes, side="right") for each in bounds.T)
+    return np.asarray(begun > ended)
 
 
 def _ended(group: Group) -> NDArray[np.bool_]:
@@ -272,23 +283,20 @@ class Conditions(NamedTuple):
         return cls(limits, choice.collisions, furniture, getattr(choice.modules, "errors", None))
 
 
-def unlike_episodes(batches: Iterable[tuple[int, str | None]]) -> frozenset[int]:
-    """Return the episodes all of whose batches of rollouts had other conditions than the present ones.
+def unlike_rollouts(batches: Sequence[tuple[int, int, str | None]]) -> list[tuple[int, int]]:
+    """Return the ranges of node ids of the batches of rollouts whose conditions are other than the present ones.
 
     Args:
-        batches: numbers of episodes with the description of the scene of a batch.
+        batches: of each batch the first id, the end of its ids, and the description of its scene.
     """
     present, scenes = Conditions.at_present(), dict[str | None, bool]()
     if present is None:
-        return frozenset()
-    alike, unlike = set[int](), set[int]()
-    for episode, scene in batches:
-        if scene not in scenes:
-            recorded = Conditions.of_scene(scene)
-            errors = None if recorded is None else recorded.errors if present.errors is None else present.errors
-            scenes[scene] = recorded in (None, present._replace(errors=errors))
-        (alike if scenes[scene] else unlike).add(episode)
-    return frozenset(unlike - alike)
+        return []
+    for scene in {scene for *_, scene in batches}:
+        recorded = Conditions.of_scene(scene)
+        errors = None if recorded is None else recorded.errors if present.errors is None else present.errors
+        scenes[scene] = recorded in (None, present._replace(errors=errors))
+    return [(first, end) for first, end, scene in batches if not scenes[scene]]
 
 
 # === present situation ========================================================================================

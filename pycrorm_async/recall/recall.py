@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Select, select
+from sqlalchemy import Select, and_, select
 
 from pycrorm_async import errors
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, microseconds_of
@@ -48,7 +48,7 @@ from pycrorm_async.recall.prediction import (
     predict,
     present_situation,
     situations_of,
-    unlike_episodes,
+    unlike_rollouts,
 )
 from pycrorm_async.recall.search import dtype_of
 from pycrorm_async.store.log import EventLog, episode_named
@@ -74,7 +74,7 @@ class Recall:
         self._reader = reader
         self._reading = reading
         self._clock = clock
-        self._batches: tuple[int, Sequence[tuple[int, str | None]]] = (0, ())
+        self._batches: tuple[int, Sequence[tuple[int, int, str | None]]] = (0, ())
 
     @property
     def reader(self) -> CaseReader:
@@ -221,16 +221,20 @@ class Recall:
         for dtype, kind in {each.type: type(action) for each, action in zip(situations, actions, strict=True)}.items():
             aliases = aliases_of(kind) if kind.__dtype__ == dtype else ()
             library = await self._reader.library(dtype, aliases)
-        return predict(library, situations, unlike_episodes(await self._rollouts(library)))
+        return predict(library, situations, unlike_rollouts(await self._rollouts(library)))
 
-    async def _rollouts(self, library: CaseLibrary) -> Sequence[tuple[int, str | None]]:
-        """Return the numbers of the stored episodes with rollouts, each with the scene of a batch."""
-        batch, count = BatchRolloutAction, library.size("BatchRolloutAction")
+    async def _rollouts(self, library: CaseLibrary) -> Sequence[tuple[int, int, str | None]]:
+        """Return the stored batches of rollouts: the node, the lowest id after its end, and the scene."""
+        batch, node, count = BatchRolloutAction, TaskTreeNode, library.size("BatchRolloutAction")
         if count != self._batches[0]:
-            rows = await self._reading.rows(select(batch.id, batch.process_metadata_id, batch.scene))
-            ids = [node for node, _, _ in rows]
+            same = and_(node.id == batch.id, node.process_metadata_id == batch.process_metadata_id)
+            rows = await self._reading.rows(select(batch.id, node.end_sequence, batch.scene).join(node, same))
+            ids = [each for each, _, _ in rows]
             is_whole = all(np.isin(each.nodes, ids).all() for each in library.groups("BatchRolloutAction"))
-            self._batches = count if is_whole else -1, list({(number, scene) for _, number, scene in rows})
+            self._batches = (
+                count if is_whole else -1,
+                [(each, row_id_min(row_key(each).number, end or SEQUENCE_MAX), scene) for each, end, scene in rows],
+            )
         return self._batches[1]
 
     def _answer(self, cue: search.Cue, library: CaseLibrary) -> Answer:
