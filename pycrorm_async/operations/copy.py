@@ -242,6 +242,8 @@ class _Copier:
         shared = min(row.head, head)
         if shared:
             await self._compare(row._replace(head=shared))
+        if shared == row.head:
+            return
         is_intact = isinstance(self._source, Lake) and self._source.is_intact(row)
         async for page in self._source.pages(row, after=shared):
             events = self._batch.setdefault(row.identity, [])
@@ -262,15 +264,13 @@ class _Copier:
         """Compare the shared events of both logs. Raises `LogDamaged` at the first difference."""
         target_row = await self._target.episode(shared.identity)
         assert target_row is not None, "its head is above zero"
-        target_pages = self._target.pages(target_row._replace(head=shared.head))
+        target_pages = self._target.pages(target_row._replace(head=shared.head))  # of another length than the source's
+        others = (other async for page in target_pages for other in page)
         async for page in self._source.pages(shared):
-            target_page = await anext(target_pages)
-            for event, other in zip(page, target_page, strict=False):
-                if event[1:] != other[1:]:
+            for event in page:
+                if event[1:] != (await anext(others))[1:]:
                     reason = f"{self._target.address} has another event with this sequence than {self._source.address}"
                     raise LogDamaged(shared.id, event.sequence, reason)
-            if len(target_page) < len(page):
-                await anext(target_pages)  # raises `LogDamaged` with the missing event
             self._progress(len(page))
 
     async def _numbered(self, lake: Lake, rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:

@@ -305,7 +305,7 @@ class Lake:
 
     async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
         """Yield the events of an episode in pages; one that two memories archived at the same time, once."""
-        events = self._read(episode)[after:]
+        events = self._read(episode)[after : episode.head]
         del self._events[episode.id]
         for first in range(0, len(events), _PAGE_EVENTS):
             yield events[first : first + _PAGE_EVENTS]

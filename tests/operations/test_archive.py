@@ -319,6 +319,7 @@ async def test_of_an_episode_that_was_changed_in_the_lake_the_events_before_an_u
 ) -> None:
     url = put_memory(tmp_path / "memory.db")
     ids = await recorded(url, "first", "second", "third")
+    logs = logs_of(url)
     await archived(url, lake)
     with closing(open_lake(lake, write=True)) as connection:
         for episode, payload in ((ids[0], "'{'"), (ids[1], "payload || ' '")):
@@ -328,6 +329,28 @@ async def test_of_an_episode_that_was_changed_in_the_lake_the_events_before_an_u
     assert f"{ids[0]}, event 3: its payload cannot be read" in str(unreadable.damage)
     assert f"{ids[1]}: its digest differs from that in {lake}" in str(changed.damage)
     assert whole.damage is None
+    mend = f"UPDATE event SET payload = '{logs[ids[0]][2][-1]}' WHERE episode = '{ids[0]}' AND sequence = 3"
+    with closing(open_lake(lake, write=True)) as connection:
+        connection.execute(mend)
+    [again] = (await copy_episodes(lake, url, episodes=[ids[0]])).episodes
+    assert (again.were_there, again.damage, logs_of(url)[ids[0]]) == (2, None, logs[ids[0]])
+
+
+async def test_of_a_long_episode_that_was_restored_before_each_event_is_compared_again(
+    tmp_path: Path, lake: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    await notes(url, *map(str, range(150)))
+    [(identity, events)] = logs_of(url).items()
+    assert len(events) > 260
+    await archived(url, lake)
+    for page_events in (5_000, 257):  # a page of the memory has 250
+        monkeypatch.setattr("pycrorm_async.store.lake._PAGE_EVENTS", page_events)
+        assert [(await copy_episodes(lake, url)).episodes[0].damage for _ in range(2)] == [None, None]
+    with closing(open_lake(lake, write=True)) as connection:
+        connection.execute(f"UPDATE event SET wall_ns = wall_ns + 1 WHERE sequence = {len(events)}")
+    [done] = (await copy_episodes(lake, url)).episodes
+    assert f"{identity}, event {len(events)}: {url} has another event with this sequence" in str(done.damage)
 
 
 async def test_a_lake_takes_no_episode_again_that_was_erased_from_it(tmp_path: Path, lake: str) -> None:
