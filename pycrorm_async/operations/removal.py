@@ -83,9 +83,9 @@ def ages_from(rows: Sequence[EpisodeRow], now_ns: int) -> Iterator[tuple[Episode
     stored before it: a robot whose clock was years behind when it recorded does not lose what it just stored. Starts
     that are still to come, of a clock that was ahead, do not count.
 
-    >>> rows = [EpisodeRow(1, "", 2, 2, 900, 950), EpisodeRow(2, "", 2, 2, 0, 50), EpisodeRow(3, "", 2, 2, 5000, 5050)]
+    >>> rows = [EpisodeRow(1, "", 2, 2, 900, 950), EpisodeRow(2, "", 2, 2, 5000, 5050), EpisodeRow(3, "", 2, 2, 0, 50)]
     >>> [from_ns for _, from_ns in ages_from(rows, 1000)]
-    [950, 900, 5050]
+    [950, 5050, 900]
     """
     stored_ns = 0
     for row in rows:
