@@ -344,9 +344,12 @@ async def test_of_a_long_episode_that_was_restored_before_each_event_is_compared
     [(identity, events)] = logs_of(url).items()
     assert len(events) > 260
     await archived(url, lake)
+    with closing(open_lake(lake, write=True)) as connection:  # as two archives at the same time leave it
+        connection.execute("INSERT INTO event FROM event")
     for page_events in (5_000, 257):  # a page of the memory has 250
         monkeypatch.setattr("pycrorm_async.store.lake._PAGE_EVENTS", page_events)
         assert [(await copy_episodes(lake, url)).episodes[0].damage for _ in range(2)] == [None, None]
+    assert logs_of(url) == {identity: events}
     with closing(open_lake(lake, write=True)) as connection:
         connection.execute(f"UPDATE event SET wall_ns = wall_ns + 1 WHERE sequence = {len(events)}")
     [done] = (await copy_episodes(lake, url)).episodes
