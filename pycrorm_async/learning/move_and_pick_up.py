@@ -389,7 +389,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         """
         if self._model is None:
             return self.chosen((self.policy_here() if policy is None else policy).sample(rng)[0])
-        context, clearance = self._context(self._model), base_clearance()
+        context, clearance = self.context_for(self._model), base_clearance()
 
         def possible(choice: PickUpChoice) -> bool:
             return clearance is None or self.is_clear(choice, clearance)
@@ -424,7 +424,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         if model is None:
             samples = policy.sample(self._rng, count)
             return samples, policy.likelihood(samples)
-        context = self._context(model)
+        context = self.context_for(model)
         if isinstance(model, PolarPolicy):
             proposals = self._polar_ways(model, self._rng, count, context, policy)
             return proposals, model.likelihood(proposals, context)
@@ -435,9 +435,10 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         """Return the action for this choice, with the prediction of a model."""
         if self._model is None:
             return self.chosen(choice)
-        return self._predicted(self._model, [choice], self._context(self._model))[0]
+        return self._predicted(self._model, [choice], self.context_for(self._model))[0]
 
-    def _context(self, model: SuccessModel | PolarPolicy) -> PickUpContext:
+    def context_for(self, model: AnyPolicy) -> PickUpContext:
+        """Return the object's context for the robot. Raises `CallerError` for a success model of another robot."""
         robot = objects.require_robot()
         if isinstance(model, SuccessModel) and model.robot not in (None, robot.body.name, robot.description.name):
             message = f"the success model {self.policy_name} was fitted to pick-ups of {model.robot}"

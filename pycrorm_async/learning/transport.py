@@ -17,6 +17,7 @@ Drawn at random, as many ways miss most of the tasks that have few solutions, su
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import suppress
@@ -99,10 +100,6 @@ class TransportPolicy:
         places = self.places(target, goal)
 
         @cache
-        def placeable(arm: Arms, grasp: Grasp) -> float:
-            return places.chance(arm, grasp)
-
-        @cache
         def takes(arm: Arms, grasp: Grasp) -> bool:
             return self.takes(target, arm, grasp)
 
@@ -110,13 +107,13 @@ class TransportPolicy:
             otherwise = self.policy if self.policy != SuccessModel.untrained() else None
             async for way in RecalledPickUp(target, arms, policy=otherwise, samples=PROPOSALS, rng=self._rng):
                 hold = way.arm, way.grasp
-                if takes(*hold) and self.reaches(way, getattr(way, "torso", None)) and placeable(*hold):
+                if takes(*hold) and self.reaches(way, getattr(way, "torso", None)) and await places.chance(*hold):
                     yield way
             return
         action = MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
         action.keep_policy()
         obj = objects.in_world(target)
-        region, context = free_and_visible(objects.require_robot(), obj), context_of(obj)
+        region, context = free_and_visible(objects.require_robot(), obj), action.context_for(self.policy)
         holds = [hold for hold in product(arms, Grasp) if takes(*hold)]
         weights: dict[int, float] = {}
         tried: list[PickUpChoice] = []
@@ -130,12 +127,13 @@ class TransportPolicy:
             for each in tried:
                 chances *= 1 - _alike(each, choices) / 2
             while chances.any():
+                await asyncio.sleep(0)  # a search may take seconds
                 best = int(chances.argmax())
                 choice, number = choices[best], int(hold_of[best])
                 if not self.reaches(action.chosen(choice), choice.torso):
                     chances[best] = 0.0
                 elif number not in weights:  # until then its chance is too high, so that no better one is missed
-                    weights[number] = placeable(*holds[number])
+                    weights[number] = await places.chance(*holds[number])
                     chances[hold_of == number] *= weights[number]
                 else:
                     chances[best] = 0.0
@@ -253,13 +251,20 @@ class Places:
         self._ways, self._target, self._goal = ways, target, goal
         self._context = context_of(target, at=goal)
         self._searches: list[list[Stand]] = []
+        self._chances: dict[tuple[Arms, Grasp], float] = {}
 
-    def chance(self, arm: Arms, grasp: Grasp) -> float:
-        """Return the chance to place the object with this arm and grasp; 0 if no place is found."""
-        for place, chance in self.of(arm, grasp):
-            if isinstance(place, locations.Location):
-                return chance
-        return 0.0
+    async def chance(self, arm: Arms, grasp: Grasp) -> float:
+        """Return the chance to place the object with this arm and grasp; 0 if no place is found.
+
+        A hold is searched once, which may take seconds; other tasks run meanwhile.
+        """
+        if (hold := (arm, grasp)) not in self._chances:
+            for place, chance in self.of(arm, grasp):
+                await asyncio.sleep(0)
+                if isinstance(place, locations.Location):
+                    self._chances[hold] = chance
+                    break
+        return self._chances.setdefault(hold, 0.0)
 
     def of(self, arm: Arms, grasp: Grasp) -> Iterator[tuple[locations.Location | Refusal, float]]:
         """Yield the places for this arm and grasp, the likeliest of a search first, each with its chance or refusal."""

@@ -119,6 +119,31 @@ async def test_a_policy_is_asked_with_async_for_and_says_so() -> None:
             policy().placing(thing, Arms.LEFT, Pose((0, 0, 3))).resolve()
 
 
+async def test_other_tasks_run_while_a_way_is_searched() -> None:
+    turns = 0
+
+    async def count_turns() -> None:
+        nonlocal turns
+        while True:
+            await asyncio.sleep(0)
+            turns += 1
+
+    with tasks.kitchen(Disturbance()) as here:
+        thing, _ = here.prepare(69, 4)
+        counting = asyncio.create_task(count_turns())
+        assert [each async for each in policy().fetching(thing, ARMS, Pose((0, 0, 3)))] == []
+        counting.cancel()
+    assert turns > 100
+
+
+async def test_a_model_of_another_robot_is_refused_where_no_way_is_possible() -> None:
+    model = SuccessModel("grasp-polar", 1, 1.0, (), "courier", 100, 40)
+    with tasks.kitchen(Disturbance()) as here:
+        thing, _ = here.prepare(69, 4)
+        with pytest.raises(CallerError, match="was fitted to pick-ups of courier"):
+            await anext(TransportPolicy(model).fetching(thing, ARMS, Pose((0, 0, 3))))
+
+
 async def test_where_nothing_is_remembered_recall_is_followed_by_the_model() -> None:
     model = SuccessModel("grasp-polar", 1, 1.0, (), None, 100, 40)
     async with Memory.open("sqlite://"):
