@@ -15,7 +15,7 @@ from pycrorm_async.cli.output import JsonOption, counted, moment, note, print_fa
 from pycrorm_async.cli.reading import ReadingPlace
 
 if TYPE_CHECKING:
-    from pycrorm_async.learning.policy_cards import PolicyCard, Share
+    from pycrorm_async.learning.policy_cards import PolicyCard, SuccessRate
     from pycrorm_async.learning.policy_file import AnyPolicy
     from pycrorm_async.learning.recorded_policy import HeldOut
     from pycrorm_async.query.reading import Reading
@@ -110,15 +110,15 @@ def _held_out(each: HeldOut) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def _print_shares(title: str, shares: Mapping[str, Share]) -> None:
+def _print_shares(title: str, shares: Mapping[str, SuccessRate]) -> None:
     if shares:
         print_table(title, ("", "succeeded"), [(name, str(share)) for name, share in shares.items()])
 
 
 def _of(successes: int, tries: int) -> str:
-    from pycrorm_async.learning.policy_cards import Share
+    from pycrorm_async.learning.policy_cards import SuccessRate
 
-    return str(Share.of(successes, tries))
+    return str(SuccessRate.of(successes, tries))
 
 
 def percent(share: float | None) -> str:

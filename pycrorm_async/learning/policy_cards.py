@@ -41,7 +41,7 @@ _ROUNDING: Final = 1e-6
 
 
 @dataclass(frozen=True)
-class Share:
+class SuccessRate:
     """The share of some tries that succeeded, with its 95 % interval; `rate` is None without a try."""
 
     successes: int
@@ -50,7 +50,7 @@ class Share:
     interval: tuple[float, float]
 
     @classmethod
-    def of(cls, successes: int, tries: int) -> Share:
+    def of(cls, successes: int, tries: int) -> SuccessRate:
         return cls(successes, tries, successes / tries if tries else None, interval_95(successes, tries))
 
     def __str__(self) -> str:
@@ -102,7 +102,7 @@ class PolicySummary:
     objects: tuple[str, ...]
     learned_from: int | None
     used: int
-    succeeded: Share
+    succeeded: SuccessRate
     learned_at: datetime | None
 
 
@@ -123,8 +123,8 @@ class PolicyCard:
     features: str
     size: int | None
     trainings: tuple[Training, ...]
-    heights: Mapping[float, Share]
-    scenes: Mapping[str, Share]
+    heights: Mapping[float, SuccessRate]
+    scenes: Mapping[str, SuccessRate]
     evaluation: Evaluation | None
 
 
@@ -273,5 +273,5 @@ def _summary(
     )  # fmt: skip
 
 
-def _share(counts: Mapping[bool, int]) -> Share:
-    return Share.of(counts[True], counts[True] + counts[False])
+def _share(counts: Mapping[bool, int]) -> SuccessRate:
+    return SuccessRate.of(counts[True], counts[True] + counts[False])

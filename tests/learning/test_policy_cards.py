@@ -12,7 +12,7 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Blob
 from pycrorm_async.learning import MoveAndPickUp, Scene, batch_rollout, default_policy, name_of, record_policy
-from pycrorm_async.learning.policy_cards import Share, read_card, read_policies
+from pycrorm_async.learning.policy_cards import SuccessRate, read_card, read_policies
 from pycrorm_async.learning.recorded_policy import CalibrationBin, Evaluation, HeldOut, read_policy
 from pycrorm_async.plan import PlanFailure
 from pycrorm_async.query.success import interval_95
@@ -53,7 +53,7 @@ async def test_a_card_has_the_origin_of_a_policy_and_the_success_of_what_it_chos
         successes, tries = tally.successes + lower.successes, 26
         assert (summary.name, summary.kind, summary.robots, summary.objects) == (NAME, "tree", ("pr2",), ("MILK",))
         assert (summary.learned_from, summary.used) == (42, tries)
-        assert summary.succeeded == Share(successes, tries, successes / tries, interval_95(successes, tries))
+        assert summary.succeeded == SuccessRate(successes, tries, successes / tries, interval_95(successes, tries))
 
         card = await read_card(memory.reading, NAME[:4])
         assert card.summary == summary
