@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import sqlite3
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -390,6 +392,30 @@ async def test_a_lake_that_has_episodes_and_is_away_is_not_made_anew(tmp_path: P
     (tmp_path / "away").rename(tmp_path / "lake")
     await archived(url, lake)
     assert query_lake(lake, "SELECT count(*) FROM episode")[1] == [(2,)]
+
+
+async def test_an_archive_waits_for_a_catalog_that_another_process_locks_at_its_commit(
+    tmp_path: Path, lake: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    await recorded(url, "first")
+    holder = (
+        "import sqlite3, time; c = sqlite3.connect('lake/catalog.sqlite', isolation_level=None, timeout=30);"
+        " c.execute('BEGIN IMMEDIATE'); print('held', flush=True); time.sleep(1)"
+    )
+    execute, holders = Lake.execute, list[subprocess.Popen[str]]()
+
+    def locked_once(self: Lake, sql: str, parameters: Sequence[object] = ()) -> list[tuple[object, ...]]:
+        if sql == "COMMIT" and not holders:
+            holders.append(subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True))
+            assert holders[0].stdout is not None
+            assert holders[0].stdout.readline() == "held\n"
+        return execute(self, sql, parameters)
+
+    monkeypatch.setattr(Lake, "execute", locked_once)
+    summary = await archived(url, lake)
+    assert (len(summary.removed), summary.stayed) == (1, {})
+    assert holders[0].communicate()[0] == ""
 
 
 async def test_an_episode_that_differs_from_the_lake_stays_in_the_memory(tmp_path: Path, lake: str) -> None:
