@@ -31,6 +31,7 @@ from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
     DatabaseUnavailable,
+    LogDamaged,
     MissingExtra,
     QueryRefused,
     UnknownEpisode,
@@ -39,7 +40,7 @@ from pycrorm_async.events.ids import SEQUENCE_MAX
 from pycrorm_async.events.types import references_in
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.placement import PLAIN, Placement
-from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent, when_and_why
+from pycrorm_async.store.stored import EpisodeRow, RunningDigest, StoredEvent, consecutive, when_and_why
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -304,11 +305,16 @@ class Lake:
         return episode.row
 
     async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
-        """Yield the events of an episode in pages; one that two memories archived at the same time, once."""
-        events = self._read(episode)[after : episode.head]
+        """Yield the events of an episode in pages; one that two memories archived at the same time, once.
+
+        Raises `LogDamaged` at the first missing event.
+        """
+        events = consecutive(self._read(episode)[: episode.head], 0)
         del self._events[episode.id]
-        for first in range(0, len(events), _PAGE_EVENTS):
+        for first in range(after, len(events), _PAGE_EVENTS):
             yield events[first : first + _PAGE_EVENTS]
+        if len(events) < episode.head:
+            raise LogDamaged(episode.id, len(events) + 1, f"is missing in {self.address}")
 
     def is_intact(self, episode: EpisodeRow) -> bool:
         """Return whether the events of an episode have the digest that they had in the memory that archived them."""

@@ -320,13 +320,18 @@ async def test_of_an_episode_that_was_changed_in_the_lake_the_events_before_an_u
     tmp_path: Path, lake: str
 ) -> None:
     url = put_memory(tmp_path / "memory.db")
-    ids = await recorded(url, "first", "second", "third")
+    ids = await recorded(url, "first", "second", "third", "fourth", "fifth")
     logs = logs_of(url)
     await archived(url, lake)
     with closing(open_lake(lake, write=True)) as connection:
         for episode, payload in ((ids[0], "'{'"), (ids[1], "payload || ' '")):
             connection.execute(f"UPDATE event SET payload = {payload} WHERE episode = '{episode}' AND sequence = 3")
-    unreadable, changed, whole = (await copy_episodes(lake, url)).episodes
+        connection.execute(f"DELETE FROM event WHERE episode = '{ids[3]}' AND sequence > 4 OR episode = '{ids[4]}'")
+    done = {each.id: each for each in (await copy_episodes(lake, url)).episodes}
+    unreadable, changed, whole, *lacking = (done[each] for each in ids)
+    for each, head in zip(lacking, (4, 0), strict=True):
+        assert each.head == head
+        assert f"{each.id}, event {head + 1}: is missing in {lake}" in str(each.damage)
     assert (unreadable.head, changed.head, whole.head) == (2, whole.head, whole.copied)
     assert f"{ids[0]}, event 3: its payload cannot be read" in str(unreadable.damage)
     assert f"{ids[1]}: its digest differs from that in {lake}" in str(changed.damage)
