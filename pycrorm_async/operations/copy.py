@@ -280,8 +280,11 @@ class _Copier:
         numbers = {row.id: row.number for row in restored.values()}
         digests = await self._target.last_digests(min(numbers.values(), default=1), max(numbers.values(), default=1))
         for row in restored.values():
-            digest, there = digests.get(row.number), archived[row.id]
-            if digest is not None and digest.sequence == there.head and digest.digest != there.digest:
+            digest, there = digests.get(row.number), archived.get(row.id)
+            if there is None:
+                why = f"was erased from {lake.address} meanwhile: `pycrorm erase` removes it here too"
+                self._damage[row.id] = f"episode {row.id} {why}"
+            elif digest is not None and digest.sequence == there.head and digest.digest != there.digest:
                 self._damage[row.id] = f"episode {row.id}: its digest differs from that in {lake.address}"
         return [row._replace(number=numbers.get(row.id, 0)) for row in rows]
 

@@ -27,6 +27,7 @@ from pycrorm_async.recall.recall import Recall
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.lake import Lake, erase_in_lake, open_lake, query_lake
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow
 from tests.commands import pycrorm
 from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import ask, put_memory
@@ -361,6 +362,27 @@ async def test_of_a_long_episode_that_was_restored_before_each_event_is_compared
         connection.execute(f"UPDATE event SET wall_ns = wall_ns + 1 WHERE sequence = {len(events)}")
     [done] = (await copy_episodes(lake, url)).episodes
     assert f"{identity}, event {len(events)}: {url} has another event with this sequence" in str(done.damage)
+
+
+async def test_an_episode_that_is_erased_from_the_lake_during_its_restore_is_named(
+    tmp_path: Path, lake: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    ids = await recorded(url, "first", "second")
+    await archived(url, lake)
+    read, done = Lake.is_intact, list[bool]()
+
+    def erased_then(self: Lake, episode: EpisodeRow) -> bool:
+        done.append(read(self, episode))  # reads both
+        if len(done) == 1:
+            process = ForkedProcess(erase_until, lake, ids[0], 0)
+            assert process.wait() == 0, process.lines
+        return done[-1]
+
+    monkeypatch.setattr(Lake, "is_intact", erased_then)
+    damage = {each.id: each.damage for each in (await copy_episodes(lake, url)).episodes}
+    assert f"{ids[0]} was erased from {lake} meanwhile" in str(damage[ids[0]])
+    assert damage[ids[1]] is None
 
 
 async def test_a_lake_takes_no_episode_again_that_was_erased_from_it(tmp_path: Path, lake: str) -> None:
