@@ -491,7 +491,8 @@ async def _model_of(reading: Reading, experiment: Experiment) -> SuccessModel:
 @pytest.mark.slow
 async def test_rollouts_whose_base_collides_count_as_failures(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db", tmp_path / "spool")
-    colliding = Experiment(rollouts=150, evaluate=1, held_out=1, min_samples_leaf=2, scene=Scene(collisions=True))
+    scene = Scene(collisions=True, table=True, disturbance=Disturbance(base_m=0.1))
+    colliding = Experiment(rollouts=150, evaluate=1, held_out=1, min_samples_leaf=2, scene=scene)
     learned = await run(colliding, place)  # raises `InternalError` if a rollout is missing
     assert learned.default.tally.failures["NavigationGoalInCollision"] > 0
     assert learned.default.stages["before the pre-pose"] >= learned.default.tally.failures["NavigationGoalInCollision"]
