@@ -4,7 +4,7 @@
     python -m bench.thesis --nodes 488043 --repeat 1
     python -m bench.thesis --quick            300 nodes, on both databases
 
-Both sides store the same values. The baseline (`bench/baseline`) has the whole tree in memory, adds an object for each
+Both sides store the same values. The baseline (`bench/material/baseline.py`) has the whole tree in memory, adds an object for each
 row to a session and commits once. This package has the tree as events in the folder of a dead recorder, which a daemon
 discovers, appends and folds. The measured time ends when every row is in every table. It excludes the start of
 processes and the creation of the baseline's tables; it includes the creation of our tables for the types of nodes, and
