@@ -4,14 +4,14 @@
     python -m bench.thesis --nodes 488043 --repeat 1
     python -m bench.thesis --quick            300 nodes, on both databases
 
-Both sides store the same values. The baseline (`bench/material/baseline.py`) has the whole tree in memory, adds an object for each
-row to a session and commits once. This package has the tree as events in the folder of a dead recorder, which a daemon
-discovers, appends and folds. The measured time ends when every row is in every table. It excludes the start of
-processes and the creation of the baseline's tables; it includes the creation of our tables for the types of nodes, and
-the discovery of the folder, which takes up to a fifth of a second. The sides take turns, each in its own process. The
-script prints one JSON line: for each size nodes a second, the ratios of wall and of CPU time (median, minimum and
-maximum over the turns; without the CPU time of a PostgreSQL server), rows and insert statements for a node, and MB of
-the processes. Ours has two processes, whose shared memory is counted twice.
+Both sides store the same values. The baseline (`bench/material/baseline.py`) has the whole tree in memory, adds an
+object for each row to a session and commits once. This package has the tree as events in the folder of a dead recorder,
+which a daemon discovers, appends and folds. The measured time ends when every row is in every table. It excludes the
+start of processes and the creation of the baseline's tables; it includes the creation of our tables for the types of
+nodes, and the discovery of the folder, which takes up to a fifth of a second. The sides take turns, each in its own
+process. The script prints one JSON line: for each size nodes a second, the ratios of wall and of CPU time (median,
+minimum and maximum over the turns; without the CPU time of a PostgreSQL server), rows and insert statements for a node,
+and MB of the processes. Ours has two processes, whose shared memory is counted twice.
 """
 
 from __future__ import annotations
