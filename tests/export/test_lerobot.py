@@ -354,8 +354,8 @@ def videos_of(folder: Path, feature: str, episode: int) -> list[np.ndarray]:
     path = folder / info["video_path"].format(video_key=feature, chunk_index=chunk, file_index=file)
     with av.open(str(path)) as container:
         [stream] = container.streams.video
-        declared = info["features"][feature]["info"]
-        assert (stream.codec.canonical_name, stream.pix_fmt, int(stream.base_rate)) == (
+        declared, rate = info["features"][feature]["info"], stream.base_rate
+        assert (stream.codec.canonical_name, stream.pix_fmt, rate.numerator / rate.denominator) == (
             declared["video.codec"],
             declared["video.pix_fmt"],
             declared["video.fps"],

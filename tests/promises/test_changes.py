@@ -98,7 +98,8 @@ class HelloActionPerformable(ActionAbstract):
 
 
 async def performed(url: str, *designators: ActionAbstract) -> None:
-    """Perform each in an episode of its own, until all of them are in the tables."""
+    """Perform each in an episode of its own, behind those of the dead recorder, until all of them are in the tables."""
+    await recover(url)
     async with Memory.open(url) as memory:
         for each in designators:
             await each.perform()
