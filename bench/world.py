@@ -124,7 +124,7 @@ def main() -> None:
         | ({"mujoco / bullet": round(each["mujoco"] / each["bullet"], 2)} if len(each) == len(ENGINES) else {})
         for question, each in least.items()
     }
-    print(json.dumps({"engines": engines, "us": figures}))
+    print(json.dumps({"bench": "world", "engines": engines, "us": figures}))
 
 
 if __name__ == "__main__":
