@@ -196,10 +196,10 @@ def learn(
         raise CallerError("--where belongs to --from-memory")
     if cluster is not None and "--workers" in options:
         raise CallerError("--cluster performs the rollouts in its own workers: leave out --workers")
-    if place.read_url:
+    if "--read-url" in options:  # a variable of the environment may be meant for other verbs
         raise CallerError(
-            "an experiment reads what it has just recorded, which a replica may lack: leave out --read-url"
-            " (PYCRORM_READ_URL), or learn with --from-memory"
+            "an experiment reads what it has just recorded, which a replica may lack: leave out --read-url, or learn"
+            " with --from-memory"
         )
     model = model or Learned.PLACES
     if explore is not None and model is not Learned.SUCCESS:

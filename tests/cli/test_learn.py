@@ -225,6 +225,13 @@ def test_a_wrong_cluster_is_refused_before_a_database_is_created(tmp_path: Path)
     assert (done.returncode, [*tmp_path.iterdir()]) == (2, [])
 
 
+def test_an_experiment_ignores_the_replica_that_the_environment_names(tmp_path: Path) -> None:
+    command = [*COMMAND, *SMALL, "--cluster", "lab"]  # refused next, before anything is tried
+    names_replica = {**environment(), "PYCRORM_READ_URL": "postgresql:///replica"}
+    done = subprocess.run(command, cwd=tmp_path, env=names_replica, capture_output=True, text=True, check=False)
+    assert "no Dask scheduler answers at lab" in one_line_of(done)
+
+
 def test_without_the_extra_the_error_names_it(tmp_path: Path) -> None:
     (tmp_path / "jpt.py").write_text("raise ImportError")  # imported before the real one
     done = pycrorm(*SMALL, cwd=tmp_path)

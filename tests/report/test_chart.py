@@ -162,7 +162,7 @@ def test_the_map_of_the_chart_shows_the_drawn_part_and_the_failures_and_is_dragg
         assert tab.ask(WINDOW) == pytest.approx([1, 1 + high - low])
         mouse(tab, "mouseReleased", axis, 100, 22)
         mouse(tab, "mouseMoved", axis, 600, 22)
-        assert tab.ask(f"{WINDOW}[0]") == 1  # it was let go
+        assert tab.ask(f"{WINDOW}[0]") == 1  # released: nothing is dragged any more
         assert tab.ask("pycrormPage.event") == 85
         mouse(tab, "mousePressed", axis, right, 4)  # above the map are the labels of the axis itself
         mouse(tab, "mouseReleased", axis, right, 4)

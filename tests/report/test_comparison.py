@@ -140,7 +140,7 @@ def test_both_scenes_are_played_on_one_clock(chrome: Browser, url: str, tmp_path
         tab.ask(
             f"{button}.click(); pycrormComparison.slider.value = 900; "
             "pycrormComparison.slider.dispatchEvent(new Event('input'))"
-        )  # it goes on from there
+        )  # the playback continues from this moment
         tab.wait_for("!pycrormComparison.playback.running")
         shown, (first, second) = tab.ask("shown"), tab.ask(times)
         assert [each[0] for each in shown] == sorted(each[0] for each in shown)
