@@ -108,7 +108,7 @@ class Parting:
         where: the node's path.
         runs: number of the runs in which the node around it was.
         outcomes: the episodes by the status and reason of the node, or `not started`, the most frequent outcome first.
-        first: True for the first parting below which there is none: later and outer ones may follow from it.
+        first: True for the first parting that has no other parting below it; its ancestors may part because of it.
     """
 
     where: str
@@ -134,7 +134,7 @@ class AlignedNode:
     """A node of the trees of several runs, which correspond by their paths.
 
     Attributes:
-        nodes: the node in each run that has the node around it, by the number of the episode; None where it misses.
+        nodes: this node in each run that has its parent, by the number of the episode; None if the run lacks the node.
     """
 
     path: _Path
@@ -177,7 +177,7 @@ class AlignedRuns:
 
     @property
     def partings(self) -> list[Parting]:
-        """The nodes that ended in several ways. One that misses in a run with all around it is not counted for it."""
+        """The nodes that ended in several ways. A run that lacks the parent too is not counted."""
         return [
             Parting(_path_text(each.path), len(each.nodes), each.outcomes, first=each is self.first_parting)
             for each in self.nodes
