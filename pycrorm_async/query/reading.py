@@ -292,8 +292,7 @@ class Reading:
 
         >>> await reading.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GROUP BY dtype")
 
-        Raises `QueryRefused`, on PostgreSQL also for a login that has more rights than
-        `pycrorm_reader` and cannot take this role.
+        Raises `QueryRefused`, on PostgreSQL also for a login that may not take the role `pycrorm_reader`.
         """
         await self._ready()
         return await ReadOnlySql(self._log).query(sql, limits)

@@ -8,7 +8,7 @@ async with sql.stream("SELECT * FROM event", SqlLimits(rows=None)) as rows:
 **Theory of operation.** The text of a query is untrusted: a user or a language model wrote it. Each query has a
 connection of its own, which is closed after it, so that no setting, lock or temporary table outlives a query. The
 database refuses everything but reading, each by its own means: SQLite by an authorizer, in a process with limits
-(section "sqlite reader"), PostgreSQL by a login without other rights, a read-only transaction and a cursor (section
+(section "sqlite reader"), PostgreSQL by a role without other rights, a read-only transaction and a cursor (section
 "postgresql reader"). Parsing the text here would not do, because a parser that differs from the database's in one
 detail would let a statement through.
 
@@ -38,7 +38,7 @@ from sqlalchemy.ext.asyncio import AsyncEngine
 from pycrorm_async.errors import QueryRefused
 from pycrorm_async.query.text import NotebookValue, nearest
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql_engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
+from pycrorm_async.store.postgresql_engine import LOG_SCHEMA, VIEWS_SCHEMA
 
 if TYPE_CHECKING:
     import asyncpg
@@ -77,18 +77,16 @@ def _value(value: Any) -> Any:
 # **Theory of operation.** A read-only transaction is not enough: as a superuser, `pg_read_file` reads files of the
 # server and COPY … TO PROGRAM runs programs on it. Four independent checks apply:
 #
-# 1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere. Or it takes this role
-#    for the transaction, as the owner on a laptop does. Code that runs in the query could then return to the login's
-#    rights, so none may be there: no function but PostgreSQL's own is called, and what the reader can reach, such as a
-#    view or a domain, belongs to the login itself or to roles that have its rights anyway (`_PLANTED`).
+# 1. The transaction takes the role `pycrorm_reader`, whatever rights the login has. A query cannot return to these
+#    rights, because the statements that would are refused by 2, and the function `set_config` by 4.
 # 2. The text is prepared, so it is one statement, and becomes the query of a cursor: PostgreSQL takes nothing but
 #    SELECT, VALUES and TABLE there, no SET, COPY, DO, CALL or SELECT INTO.
 # 3. The transaction is READ ONLY and always rolled back, and the connection is closed after it.
 # 4. A function that PostgreSQL declares VOLATILE may have effects that no rollback undoes: it ends other sessions,
 #    takes locks, changes settings, runs a text as SQL. A text with the name of one, or of an operator or aggregate over
 #    one, is refused. Strings and comments count too, because leaving them out would need PostgreSQL's own lexer. A
-#    view, a cast or a type calls functions that the text does not name. One outside the memory, which every login may
-#    use, over a volatile function with the rights of its owner, gives these rights to each query.
+#    superuser's query calls no function but PostgreSQL's own, because others may run a text without being volatile.
+#    What the text does not name is not checked: a view, a cast or a type that calls such a function.
 #
 # The cursor returns with each row the sum of the bytes up to it, and empty values from the bound on, because one value
 # can have a gigabyte.
@@ -100,90 +98,27 @@ _BEGIN = (
     "SET LOCAL standard_conforming_strings = on",
     "SET LOCAL idle_in_transaction_session_timeout = '10min'",  # a pager stops reading for minutes
 )
-_SCHEMAS = f"'{LOG_SCHEMA}', '{TABLES_SCHEMA}', '{VIEWS_SCHEMA}'"
-_MORE = (
-    "(nspname !~ '^pg_' AND has_{privilege}_privilege(session_user, {object}, '{rights}')"
-    f" AND NOT COALESCE(has_{{privilege}}_privilege(to_regrole('{READER}'), {{object}}, '{{rights}}'), false))"
-)
-"""The condition that the login has one of these rights outside the system's schemas, and the reader has none."""
-_RIGHTS = f"""
-SELECT session_user::text AS login, coalesce(pg_has_role(session_user, to_regrole('{READER}'), 'MEMBER'), false)
-    AS may_take, coalesce(has_schema_privilege(to_regrole('{READER}'), '{VIEWS_SCHEMA}', 'USAGE'), false) AS has_roles,
-CASE
-    WHEN login.rolsuper THEN 'is a superuser'
-    WHEN pg_has_role(session_user, datdba, 'MEMBER') THEN 'owns the database'
-    WHEN login.rolcreaterole OR login.rolcreatedb OR login.rolreplication OR login.rolbypassrls
-        THEN 'may create roles or databases, replicate, or read what is hidden from its role'
-    WHEN other.name IS NOT NULL THEN 'is a member of ' || other.name
-    WHEN has_database_privilege(session_user, pg_database.oid, 'CREATE') THEN 'may create schemas in the database'
-    WHEN EXISTS (
-        SELECT FROM pg_namespace WHERE nspname IN ({_SCHEMAS}) AND has_schema_privilege(session_user, oid, 'CREATE')
-    ) THEN 'may create tables in the memory'
-    WHEN EXISTS (
-        SELECT FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
-        WHERE nspname IN ({_SCHEMAS}) AND relkind IN ('r', 'v', 'm', 'p') AND (
-            has_any_column_privilege(session_user, pg_class.oid, 'INSERT, UPDATE')
-            OR has_table_privilege(session_user, pg_class.oid, 'DELETE, TRUNCATE, TRIGGER')
-        )
-    ) THEN 'may change the memory'
-    WHEN elsewhere.excess IS NOT NULL THEN elsewhere.excess
-END AS excess
-FROM pg_roles AS login CROSS JOIN pg_database LEFT JOIN LATERAL (
-    SELECT min(rolname::text) AS name FROM pg_roles
-    WHERE rolname NOT IN (session_user, '{READER}') AND pg_has_role(session_user, oid, 'MEMBER')
-) AS other ON true LEFT JOIN LATERAL (
-    SELECT min(excess) AS excess FROM (
-        SELECT 'may create tables in the schema ' || nspname FROM pg_namespace
-        WHERE {_MORE.format(privilege="schema", object="oid", rights="CREATE")}
-        UNION ALL
-        SELECT 'may change the table ' || nspname || '.' || relname
-        FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
-        WHERE relkind IN ('r', 'v', 'm', 'p', 'f') AND (
-            {_MORE.format(privilege="table", object="pg_class.oid", rights="INSERT, UPDATE, DELETE, TRUNCATE, TRIGGER")}
-            OR {_MORE.format(privilege="any_column", object="pg_class.oid", rights="INSERT, UPDATE")}
-        )
-        UNION ALL
-        SELECT 'may change the sequence ' || nspname || '.' || relname
-        FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
-        WHERE relkind = 'S' AND {_MORE.format(privilege="sequence", object="pg_class.oid", rights="USAGE, UPDATE")}
-        UNION ALL
-        SELECT 'may run ' || nspname || '.' || proname || ' with the rights of its owner'
-        FROM pg_proc JOIN pg_namespace ON pg_namespace.oid = pronamespace
-        WHERE prosecdef AND {_MORE.format(privilege="function", object="pg_proc.oid", rights="EXECUTE")}
-    ) AS rights (excess)
-) AS elsewhere ON true
-WHERE login.rolname = session_user AND datname = current_database()"""  # noqa: S608  our own names only
-"""Selects the rights of the login that `pycrorm_reader` has not; null if there are none. Any table may be read."""
-
-_PLANTED = f"""
-SELECT min(kind || nspname || '.' || name || ' of ' || pg_get_userbyid(owner)) FROM (
-    SELECT 'function ', pronamespace, proname, proowner FROM pg_proc
-    UNION ALL SELECT 'operator ', oprnamespace, oprname, oprowner FROM pg_operator
-    UNION ALL SELECT 'type ', typnamespace, typname, typowner FROM pg_type WHERE typtype = 'd'
-    UNION ALL SELECT 'relation ', relnamespace, relname, relowner FROM pg_class
-        WHERE relkind IN ('v', 'f') OR relrowsecurity
-) AS code (kind, space, name, owner) JOIN pg_namespace ON pg_namespace.oid = space JOIN pg_roles ON pg_roles.oid = owner
-WHERE nspname NOT IN ('pg_catalog', 'information_schema') AND has_schema_privilege('{READER}', space, 'USAGE')
-AND NOT rolsuper AND EXISTS (
-    SELECT FROM pg_roles AS other WHERE other.rolcanlogin AND NOT other.rolsuper AND other.rolname <> session_user
-    AND pg_has_role(other.oid, owner, 'MEMBER')
-)"""  # noqa: S608  our own names only
-"""Selects code that a query could run and that a login made which has not the rights of this one; null without any."""
+_MAY_TAKE = f"""
+SELECT session_user::text AS login, has_schema_privilege(to_regrole('{READER}'), '{VIEWS_SCHEMA}', 'USAGE') AS exists,
+    pg_has_role(session_user, to_regrole('{READER}'), 'MEMBER') AS is_member"""
+"""Selects whether this memory has the role of readers, and whether the login may take it."""
 
 _VOLATILE = """
 SELECT 'function ' || f.proname FROM pg_proc AS f JOIN pg_namespace ON pg_namespace.oid = f.pronamespace
+JOIN pg_roles AS login ON login.rolname = session_user
 LEFT JOIN pg_aggregate ON aggfnoid = f.oid LEFT JOIN pg_proc AS transition ON transition.oid = aggtransfn
-WHERE ('v' IN (f.provolatile, transition.provolatile) OR $4 AND nspname NOT IN ('pg_catalog', 'information_schema'))
+WHERE ('v' IN (f.provolatile, transition.provolatile)
+    OR login.rolsuper AND nspname NOT IN ('pg_catalog', 'information_schema'))
 AND f.proname = ANY($1::text[]) AND f.proname <> ALL($2)
 AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
 UNION ALL
 SELECT 'operator ' || oprname FROM pg_operator JOIN pg_proc ON pg_proc.oid = oprcode
 JOIN pg_namespace ON pg_namespace.oid = oprnamespace
-WHERE (provolatile = 'v' OR $4 AND nspname NOT IN ('pg_catalog', 'information_schema')) AND strpos($3, oprname) > 0
+WHERE provolatile = 'v' AND strpos($3, oprname) > 0
 AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
 LIMIT 1"""
-"""Selects a function or an operator of the text that may have effects; with $4 also each that is not PostgreSQL's own.
-One of another schema is called with its schema only."""
+"""Selects a function or an operator of the text that may have effects. One of another schema is called with its schema
+only."""
 _HARMLESS = (
     "random", "random_normal", "gen_random_uuid", "clock_timestamp", "timeofday", "pg_sleep", "pg_relation_size",
     "pg_table_size", "pg_indexes_size", "pg_total_relation_size", "pg_database_size",
@@ -208,14 +143,13 @@ class _Cursor:
         self._connection = connection
         self._bytes_max = bytes_max
         self._is_first = True
-        self._has_taken_role = False
 
     async def start(self, sql: str, seconds: float) -> None:
         for statement in (*_BEGIN, f"SET LOCAL statement_timeout = {max(int(seconds * 1000), 1)}"):
             await self._connection.execute(statement)
-        await self._check_login()
+        await self._take_role()
         await self._check_functions(sql)
-        query = sql.rstrip().rstrip(";")
+        query = _without_end(sql)
         async with self._bounded(seconds):
             # `execute` would send several statements as they are; preparing refuses them.
             prepared = await self._connection.prepare(query)
@@ -224,7 +158,6 @@ class _Cursor:
             attributes = prepared.get_attributes()
             if not attributes:
                 raise QueryRefused(ONLY_READS)
-            query = await self._without_end(query)
             await (await self._connection.prepare(_declaration(query, len(attributes), self._bytes_max))).fetch()
         self.columns = tuple(each.name for each in attributes)
 
@@ -238,51 +171,22 @@ class _Cursor:
         self._is_first = False
         return [tuple(each)[:-1] for each in within], len(within) < len(records)
 
-    async def _without_end(self, query: str) -> str:
-        """Return one statement without its semicolon and the comments behind it.
-
-        PostgreSQL's own parser finds the semicolon, outside of strings and comments: it is the first token of the
-        statement that may not be in parentheses.
-        """
-        if ";" not in query:
-            return query
-        import asyncpg  # takes a tenth of a second to load, which readers of SQLite need not wait for
-
-        text = f"({query}\n)"
-        await self._connection.execute("SAVEPOINT pycrorm_end")  # an error would end the transaction
-        try:
-            await self._connection.prepare(text)
-        except asyncpg.PostgresSyntaxError as error:
-            await self._connection.execute("ROLLBACK TO SAVEPOINT pycrorm_end")
-            end = int(error.position or 0) - 1
-            return text[1:end] if text[end : end + 1] == ";" else query
-        return query
-
-    async def _check_login(self) -> None:
-        rights = await self._connection.fetchrow(_RIGHTS)
-        if rights is None or rights["excess"] is None:
-            return
-        login = f"{rights['login']} {rights['excess']}"
-        if not rights["has_roles"]:
+    async def _take_role(self) -> None:
+        role = await self._connection.fetchrow(_MAY_TAKE)
+        if not role or not role["exists"]:
+            raise QueryRefused(f"a query in SQL runs as the role {READER}: run `pycrorm roles --create` once")
+        if not role["is_member"]:
+            login = role["login"]
             raise QueryRefused(
-                f"a query in SQL needs a role that can only read, and {login}: run `pycrorm roles --create` once"
+                f"a query in SQL runs as the role {READER}, which {login} may not take: GRANT {READER} TO {login}"
             )
-        planted = await self._connection.fetchval(_PLANTED)
-        if rights["may_take"] and planted is None:
-            await self._connection.execute(f"SET LOCAL ROLE {READER}")
-            self._has_taken_role = True
-            return
-        why = "" if planted is None else f", whose rights the {planted} could use"
-        raise QueryRefused(
-            f"a query in SQL needs a login that can only read, and {login}{why}; make one:"
-            f" CREATE ROLE pycrorm_query LOGIN PASSWORD '…' IN ROLE {READER}, and use it in the URL"
-        )
+        await self._connection.execute(f"SET LOCAL ROLE {READER}")
 
     async def _check_functions(self, sql: str) -> None:
         lowered = sql.lower()
         if 'u&"' in lowered:
             raise QueryRefused('a query writes names as they are, not as U&"…"')
-        name = await self._connection.fetchval(_VOLATILE, sorted(_names(sql)), _HARMLESS, sql, self._has_taken_role)
+        name = await self._connection.fetchval(_VOLATILE, sorted(_names(sql)), _HARMLESS, sql)
         if name is not None:
             raise QueryRefused(f"{ONLY_READS}; the {name} can do more and is not allowed")
 
@@ -304,7 +208,7 @@ class _Cursor:
                 raise
             if code == _UNDEFINED_TABLE and error.server_source_function != _MISSING_FROM:
                 raise await self._missing(text) from None
-            if "multiple commands" in text:
+            if "multiple commands" in text or text == 'syntax error at or near ";"':  # what is prepared ends there
                 raise QueryRefused(NOT_ONE) from None
             notes = " ".join(each for each in (error.detail, error.hint) if each)
             hint = missing_column(text) if code == _UNDEFINED_COLUMN else ""
@@ -473,7 +377,7 @@ class ReadOnlySql:
         """Run one query and read its rows while it runs.
 
         Raises `QueryRefused` for a text that is not one query, would do more than read, is wrong, or takes longer than
-        it may; and on PostgreSQL for a login with more rights than `pycrorm_reader`. Raises `DatabaseUnavailable`.
+        it may; and on PostgreSQL for a login that may not take the role `pycrorm_reader`. Raises `DatabaseUnavailable`.
         """
         with self._log.translated():
             async with self._cursor(sql, limits) as cursor:
@@ -494,10 +398,15 @@ class ReadOnlySql:
 # The lines that refuse a query in SQL, alike on both databases.
 
 ONLY_READS = "a query may only read: it is one SELECT, or WITH … SELECT"
-NOT_ONE = "a query is one statement: this text has several"
+NOT_ONE = "a query is one statement: this text has several, or more behind its semicolon"
 NO_PARAMETERS = "a query has no parameters such as ?, :name or $1: write the values themselves"
 _INTERNAL = re.compile(r"^zz_|__\d+$|^sqlite_|^pycrorm_")
 """Names of the tables behind the views, one for each generation, and of the bookkeeping."""
+
+
+def _without_end(sql: str) -> str:
+    """Return a statement without the semicolons at its end, which a cursor and the driver of SQLite would refuse."""
+    return sql.rstrip(" \t\r\n;")
 
 
 def stopped(seconds: float) -> str:
@@ -551,7 +460,7 @@ _ACTIONS = {
     )
 } | {sqlite3.SQLITE_ATTACH: "ATTACH or VACUUM"}  # fmt: skip
 """The action's name by its code, which other constants share. VACUUM attaches a database itself."""
-_REFUSALS = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_AUTH, sqlite3.SQLITE_TOOBIG)
+_REFUSALS = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_AUTH, sqlite3.SQLITE_TOOBIG, sqlite3.SQLITE_MISMATCH)
 """Codes of errors that are the query's own; all others are the database's."""
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
 """Codes of a temporary file that cannot grow, because a reader writes no other."""
@@ -560,17 +469,6 @@ _FAULT_VALUES = 5
 _TOO_LARGE = (
     "the query has a value of more than 16 MiB: select a part of it, as substr does, or raise the limit on bytes"
 )
-_WITH_EMPTY_END = re.compile(
-    r"""((?>'[^']*'?|"[^"]*"?|`[^`]*`?|\[[^]]*]?|--[^\n]*|/\*(?:.*?\*/|.*)|[^;])*+);"""
-    r"""(?>[ \t\n\f\r;]|--[^\n]*|/\*(?:.*?\*/|.*))*+""",
-    re.DOTALL,
-)
-"""A statement, a semicolon outside of its strings, quoted names and comments, and behind it no other statement.
-
-What has no end reaches to the end of the text, so that matching takes time in proportion to its length.
-"""
-_NO_INTEGER = "the query is refused: LIMIT and OFFSET must be integers"
-"""A query converts values strictly only there, so no other one has the code SQLITE_MISMATCH."""
 _TOO_MUCH = "the query needs more {} than it may use: select or sort less"
 
 
@@ -659,16 +557,6 @@ class _ProcessCursor:
         self._process.wait()
 
 
-def _without_end(sql: str) -> str:
-    """Return one statement without its semicolon and the empty statements and comments behind it.
-
-    The driver refuses empty statements as further ones. SQLite and the authorizer check what is returned, so a text
-    that SQLite divides in another way gains nothing.
-    """
-    match = _WITH_EMPTY_END.fullmatch(sql)
-    return match[1] if match else sql
-
-
 def _refusal(
     kind: str, code: int | None, text: str, denied: tuple[int, str | None] | None, names: list[str]
 ) -> Exception:
@@ -687,10 +575,6 @@ def _refusal(
         return QueryRefused(ONLY_READS)
     if code == sqlite3.SQLITE_TOOBIG and text == "string or blob too big":
         return QueryRefused(_TOO_LARGE)
-    if text.startswith("Could not decode to UTF-8 column"):
-        return QueryRefused("the query has a text that is not UTF-8: select it as bytes, with CAST(… AS BLOB)")
-    if code is not None and code & 0xFF == sqlite3.SQLITE_MISMATCH:
-        return QueryRefused(_NO_INTEGER)
     if code in _NO_ROOM:
         return QueryRefused(_TOO_MUCH.format("space for temporary files"))
     if code is None or code & 0xFF in _REFUSALS:

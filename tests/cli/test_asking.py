@@ -155,12 +155,12 @@ def test_a_query_that_is_refused_is_answered_with_one_line(words: list[str], say
     assert not (folder / "planted.db").exists()
 
 
-def test_on_a_server_a_login_with_more_rights_is_shown_how_to_make_the_roles(server: Server, tmp_path: Path) -> None:
+def test_on_a_server_without_the_roles_a_login_is_shown_how_to_make_the_roles(server: Server, tmp_path: Path) -> None:
     url = server.new_database()
     run_in_own_loop(append_and_fold(url, RECORDS[:20]))
     result = pycrorm("query", "SELECT 1", "--url", url, cwd=tmp_path)
     assert result.returncode == 2
-    assert "postgres is a superuser: run `pycrorm roles --create` once" in one_line_of(result)
+    assert "as the role pycrorm_reader: run `pycrorm roles --create` once" in one_line_of(result)
     server.drop(url)
 
 
