@@ -209,7 +209,6 @@ class _PyCRAMPlans:
         with self._episodes.open(world, **labels) as episode:
             self._episodes.real, self.seams.is_on = episode, True
             try:
-                self._prepare_types()
                 self._connect()
                 self._add_world(world)
                 yield episode
@@ -234,13 +233,6 @@ class _PyCRAMPlans:
         seams.around(used.ParallelNode, "_lang_call", self._branch)
         seams.around(used.UseProspectionWorld, "__exit__", self._leave_prospection)
         self._world.connect()
-
-    @guarded
-    def _prepare_types(self) -> None:
-        """Prepare the types of all imported designators, which is too slow to be done during the plan."""
-        for designator in self._values.designators:
-            fields, bases = self._values.expected_fields(designator), self._bases(designator)
-            self.seams.recording.prepare(self._kind(designator), _dtype(designator), fields, bases=bases)
 
     @guarded
     def _add_world(self, world: Any) -> None:

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import typing
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable
 from datetime import datetime
 from enum import Enum
 from importlib import import_module
@@ -47,13 +47,6 @@ _OBJECT_TYPES: Final = {"PhysicalObject": "GENERIC_OBJECT", "Cereal": "BREAKFAST
 """PyCRAM's concepts that have another name here."""
 AS_THEY_ARE: Final = frozenset({bool, int, float, str, datetime})
 """The types of values that are recorded without a conversion."""
-_EXPECTED_FIELDS: Final[dict[str, dict[str, FieldSpec]]] = {
-    "MoveJointsMotion": {"names": ("list", "text"), "positions": ("list", "real")},
-    "RepeatNode": {"times": "integer"},
-    "MonitorNode": {"condition": "text", "interval_s": "real"},
-    "CodeNode": {"function": "text", "arguments": ("dict", "text")},
-}
-"""The types of fields that have no full annotation, as their usual values have them."""
 _NO_INERTIAL: Final = (
     '<inertial><mass value="0.1" /><origin rpy="0 0 0" xyz="0 0 0" />'
     '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01" /></inertial>'
@@ -68,7 +61,6 @@ class PyCRAMValues:
 
     Attributes:
         pycram: the namespace of PyCRAM's classes.
-        designators: the imported actions and motions, and the expressions of the language.
     """
 
     def __init__(self) -> None:
@@ -90,11 +82,6 @@ class PyCRAMValues:
             (used.Object, "object"),
             (used.Link, "object"),
             (used.ObjectDesignatorDescription, "object"),
-        )
-        self.designators: tuple[type, ...] = (
-            *_descendants(used.ActionDescription),
-            *_descendants(used.BaseMotion),
-            *(getattr(used, name) for name in _USED["language"].split()),
         )
 
     # --- parameters -------------------------------------------------------------------------------------------
@@ -149,15 +136,6 @@ class PyCRAMValues:
             name: annotated.get(name) or self._field_type(hints.get(name, type(each)), each)
             for name, each in values.items()
         }
-
-    def expected_fields(self, designator: type) -> dict[str, FieldSpec]:
-        """Return what `field_types` returns for designators of a type; for values that leave it open, a guess."""
-        values: dict[str, Any] = dict.fromkeys(self._names_of(designator))
-        if issubclass(designator, self.pycram.MoveTorsoAction):
-            values["position"] = None
-        guessed = _EXPECTED_FIELDS.get(designator.__name__, {})
-        fields = guessed | self._annotated(designator)
-        return {name: fields.get(name, "text") for name in _with_grasp(values) or guessed}
 
     def _annotated(self, designator: type) -> dict[str, FieldSpec]:
         """Return the types of those fields whose annotations decide them, whatever their values are."""
@@ -281,13 +259,6 @@ class PyCRAMValues:
         torso = robot.joints.get(description.torso_joint) if description is not None else None
         torso_m = float(torso.position) if torso is not None else None
         return RobotValue(self.pose(robot.pose), "ROBOT", torso_m, episode.reference(self.key(robot)), robot.name)
-
-
-def _descendants(root: type) -> Iterator[type]:
-    each: type
-    for each in root.__subclasses__():
-        yield each
-        yield from _descendants(each)
 
 
 def _hints_of(designator: type) -> dict[str, Any]:

@@ -444,22 +444,10 @@ class KnownTypes:
         """Return the names of the table's fields and columns, in lower case."""
         return self._columns.get(table.lower(), {})
 
-    def state_of(self, table: str) -> tuple[str | None, int]:
-        """Return the owner of a table and the number of its names; they change with each declaration that adds any."""
-        return self._tables.get(table.lower()), len(self._columns.get(table.lower(), ()))
-
     def table_of(self, dtype: str) -> str:
         """Return the table that the nodes of a dtype are in."""
         built_in = self.built_in(dtype)
         return built_in.table if built_in is not None else event_fields.table_name(dtype)
-
-    def copy_of(self, table: str) -> KnownTypes:
-        """Return a copy that knows this table alone."""
-        copy, name = KnownTypes(self.built_in), table.lower()
-        if (owner := self._tables.get(name)) is not None:
-            copy._tables[name] = owner
-        copy._columns[name] = dict(self._columns.get(name, {}))
-        return copy
 
     def note(self, declaration: event_types.DesignatorTypeDeclared) -> None:
         """Note a declaration of this memory."""

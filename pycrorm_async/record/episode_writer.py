@@ -575,8 +575,8 @@ class EventSink(Protocol):
 #
 # Leave out what JSON cannot hold, and then the largest parts of an event that is too large, each as a whole.
 
-_CUTS = (1_000, 100, 10)
-"""Characters to shorten a text to, tried in turn until the event fits."""
+_CUT = 1_000
+"""Characters that a text of an event that is too large is shortened to."""
 _MISSING_BYTES = 400
 """Bounds from below the values worth leaving out: about the encoded size of the `MissingValue` that replaces one."""
 ROBOT = "robot state"
@@ -592,7 +592,8 @@ def fitted(event: event_types.Happening, bytes_max: int) -> tuple[event_types.Ha
     """Return the event without the parts that cannot be recorded, and the reason for each by its name.
 
     A parameter or a result becomes a `MissingValue`, an observed value null, a text is cut, and any other part gets the
-    default of its field. Raises `NotEncodable` if a part without default cannot be recorded.
+    default of its field. An event of very many small parts may still be too large. Raises `NotEncodable` if a part
+    without default cannot be recorded.
     """
     reasons: dict[str, str] = {}
     for name in event.__struct_fields__:
@@ -602,24 +603,18 @@ def fitted(event: event_types.Happening, bytes_max: int) -> tuple[event_types.Ha
         except NotEncodable as error:
             reasons[ROBOT if name == "robot" else name] = error.reason
             event = replace(event, **{name: _recordable(value, _defaults(event), name)})
-    whole = event
-    for turn, characters_max in enumerate(_CUTS):
-        sizes = {name: encoded_bytes(value) for name, value in _parts(event).items()}
-        for name in sorted(sizes, key=sizes.__getitem__, reverse=True):
-            if fits(event, bytes_max):
-                return event, reasons
-            reason = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for the record (record_bytes_max)"
-            value = _parts(event)[name]
-            is_small = sizes[name] <= _MISSING_BYTES and turn < len(_CUTS) - 1
-            if isinstance(value, event_types.MissingValue):
-                smaller: Any = event_types.MissingValue(value.missing) if turn else value
-            elif isinstance(event, event_types.NodeStarted | event_types.Observed) or name == "result":
-                smaller = value if is_small else live_values.missing_value(reason, value)
-            else:
-                smaller = _shorter(_parts(whole)[name], characters_max)
-            if smaller is not value:
-                reasons.setdefault(name, reason)
-                event = _with_part(event, name, smaller)
+    parts = _parts(event)
+    sizes = {name: encoded_bytes(value) for name, value in parts.items()}
+    for name in sorted(sizes, key=sizes.__getitem__, reverse=True):
+        if sizes[name] <= _MISSING_BYTES or fits(event, bytes_max):
+            break
+        reason = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for the record (record_bytes_max)"
+        if isinstance(event, event_types.NodeStarted | event_types.Observed) or name == "result":
+            smaller: Any = live_values.missing_value(reason, parts[name])
+        else:
+            smaller = _shorter(parts[name])
+        reasons.setdefault(name, reason)
+        event = _with_part(event, name, smaller)
     return event, reasons
 
 
@@ -641,13 +636,11 @@ def _with_part(event: event_types.Happening, name: str, part: Any) -> event_type
     return replace(event, **{name: part})
 
 
-def _shorter(part: Any, characters_max: int) -> Any:
+def _shorter(part: Any) -> Any:
     if isinstance(part, str):
-        return live_values.cut(part, characters_max)
+        return live_values.cut(part, _CUT)
     if isinstance(part, event_types.FailureValue):
-        return event_types.FailureValue(
-            live_values.cut(part.type, _CUTS[0]), live_values.cut(part.message, characters_max)
-        )
+        return event_types.FailureValue(live_values.cut(part.type, _CUT), live_values.cut(part.message, _CUT))
     return type(part)() if isinstance(part, tuple | dict) else part
 
 

@@ -51,12 +51,11 @@ class EventTimes:
     Attributes:
         began: the time of the episode's start, if its executive gave it; otherwise the clock gives the time of each
             event for which none is given.
-        backwards: the number of events that were given a time before the event before them.
     """
 
     def __init__(self, clock: Clock, at: At | None) -> None:
         self._clock = clock
-        self.backwards = 0
+        self._has_warned = False
         self.began: EventTime | None = None
         if at is not None:
             wall_ns, monotonic_ns = event_time(at)
@@ -91,10 +90,10 @@ class EventTimes:
         return self._latest, warning
 
     def _warning(self, wall_ns: int, back_ns: int, what: str) -> str | None:
-        """Count an event whose time goes back; return the line about it if it is the first of the episode."""
-        self.backwards += 1
-        if self.backwards > 1:
+        """Return the line about an event whose time goes back, if it is the first of the episode."""
+        if self._has_warned:
             return None
+        self._has_warned = True
         return (
             f"the time {_text(wall_ns)} lies {back_ns / 1e9:.3f} s before {what}: the event keeps it, and durations"
             " count from the later time (further times of this episode that go back are not reported)"

@@ -38,7 +38,7 @@ from pycrorm_async.plan.task import TaskTreeNode, current_node
 from pycrorm_async.record import episode_writer, values
 from pycrorm_async.record.camera import put_image
 from pycrorm_async.record.objects import ObjectRows
-from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, current_task
+from pycrorm_async.record.opening import EpisodeOpening, current_task
 from pycrorm_async.record.plan_types import Declarations
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.record.values import brief_pose, clean, encode_or_missing, read_parameters
@@ -213,7 +213,6 @@ class Recorder:
             world=world.description if world else None,
             simulated=simulation is not None,
             thought_by=_simulating_node(simulation),
-            strict=self._strict,
             **arguments,
         )
         episode = Episode(self._recording, opening)
@@ -476,7 +475,7 @@ def _simulating_node(simulation: Simulation | None) -> event_types.NodeReference
 
 def _description_of(simulation: Simulation) -> str:
     if simulation.description is not None:
-        return simulation.description[:EPISODE_TEXT_MAX]
+        return simulation.description
     if simulation.by is not None and simulation.by.designator is not None:
         return f"simulation in {simulation.by.designator.__dtype__}"
     return "simulation"
@@ -742,7 +741,7 @@ def _model(added: Object) -> tuple[str | None, str | None]:
 #
 # One condition variable guards the running motions. All samples are taken while it is held, so no sample follows the
 # end of its motion. Its lock is reentrant, because the garbage collector may close a dropped plan, and so call `end`,
-# in a thread that holds the lock. Therefore `_sample` checks `is_over` again after it has read the channels.
+# in a thread that holds the lock.
 
 
 class _Motion:
@@ -753,7 +752,6 @@ class _Motion:
         self.node = node
         self.robot = robot
         self.written: dict[str, float] | None = None
-        self.is_over = False
 
 
 class Sampler:
@@ -800,7 +798,6 @@ class Sampler:
             motion = self._running.pop((episode, node), None)
             if motion is not None:
                 self._sample(motion, margin=0.0)
-                motion.is_over = True
 
     def stop_episode(self, episode: episode_writer.EpisodeWriter) -> None:
         """Stop sampling all motions of an episode, before the episode ends."""
@@ -811,7 +808,7 @@ class Sampler:
         self, episode: episode_writer.EpisodeWriter
     ) -> None:  # without a loop in `with`: see `OrderedCalls`
         for key in [key for key in self._running if key[0] is episode]:
-            self._running.pop(key).is_over = True
+            del self._running[key]
 
     def close(self) -> None:
         """Stop sampling, and wait until the thread has ended."""
@@ -843,13 +840,10 @@ class Sampler:
         recorded_world = motion.episode.world
         if recorded_world is None:
             return
-        world = recorded_world.world
-        robot = motion.robot if world.has(motion.robot) else world.robot  # another may have taken its place
-        reference = recorded_world.reference(robot) if robot is not None else None
-        if robot is None or reference is None:
+        robot = motion.robot
+        reference = recorded_world.reference(robot)
+        if reference is None:
             return
-        if robot is not motion.robot:
-            motion.robot, motion.written = robot, None
         if motion.written is None:
             motion.written = dict(recorded_world.sampled.get(robot, {}))
         written = motion.written
@@ -858,8 +852,7 @@ class Sampler:
             for channel, value in _read_channels(robot).items()
             if channel not in written or abs(value - written[channel]) > margin
         }
-        # The garbage collector may have ended the motion in this thread since the channels were read.
-        if not changed or motion.is_over or self._emitter.is_closed:
+        if not changed or self._emitter.is_closed:
             return
         try:
             motion.episode.events.put(event_types.StateSampled(reference, changed, motion.node), reserved=False)

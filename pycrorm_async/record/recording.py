@@ -24,7 +24,7 @@ from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.values import clean, clean_repr
 
 _TYPES_MAX = 10_000
-"""Bounds the declared types kept for reuse, which are all dropped then, and the types prepared in advance."""
+"""Bounds the declared types kept for reuse, which are all dropped then."""
 
 
 _Arguments: TypeAlias = tuple[
@@ -69,7 +69,6 @@ class Recording:
         self._stored_episodes = stored_episodes
         self._calls = OrderedCalls()
         self._types: dict[_Arguments, declarations.DeclaredType] = {}
-        self._prepared: dict[_Arguments, tuple[declarations.Declared, tuple[str | None, int]]] = {}
         self._lock = threading.RLock()
         for each in stored:
             known_types.note_stored(each)
@@ -101,7 +100,7 @@ class Recording:
             aliases: dtypes the type had before it was renamed.
         """
         try:
-            cached = _arguments(kind, dtype, fields, bases, concept, aliases)
+            cached = kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases)
             declared = self._types.get(cached)
             if declared is None and not self.emitter.is_closed:  # first: a fork may leave the lock held
                 with self._lock:
@@ -114,23 +113,6 @@ class Recording:
             self.emitter.note_fault("DesignatorTypeDeclared", error)
         return declared or _undeclared(kind, dtype)
 
-    def prepare(
-        self, kind: RecordedKind, dtype: str, fields: Mapping[str, declarations.FieldSpec], *, bases: Sequence[str] = ()
-    ) -> None:
-        """Derive a type in advance: `type` with the same arguments then only writes it, in a third of the time.
-
-        Nothing is declared, so a type that is never asked for has no table and reserves no name. Raises nothing.
-        """
-        try:
-            table = self.known_types.table_of(dtype)
-            declared = declarations.declare_named(kind, dtype, fields, self.known_types.copy_of(table), bases=bases)
-            # A renamed type is not kept: its name depends on further tables, whose changes `state` does not show.
-            if declared.dtype is None and declared.type.payload and len(self._prepared) < _TYPES_MAX:
-                state = self.known_types.state_of(table)
-                self._prepared[_arguments(kind, dtype, fields, bases)] = declared, state
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self.emitter.note_fault("DesignatorTypeDeclared", error)
-
     def _declare(
         self,
         kind: RecordedKind,
@@ -142,16 +124,9 @@ class Recording:
     ) -> declarations.DeclaredType:
         if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
             raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
-        declared, state = self._prepared.pop((kind, dtype, fields, bases, concept, aliases), (None, None))
-        known = self.known_types
-        if declared is not None and known.state_of(declared.type.declaration.table) == state:
-            if (built_in := known.built_in(dtype)) is not None:
-                known.note_stored(built_in)
-            known.note(declared.type.declaration)
-        else:
-            declared = declarations.declare_named(
-                kind, dtype, dict(fields), known, bases=bases, concept=concept, aliases=aliases
-            )
+        declared = declarations.declare_named(
+            kind, dtype, dict(fields), self.known_types, bases=bases, concept=concept, aliases=aliases
+        )
         own, missing = declared.type, self.emitter.missing
         for name, reason in own.undeclared.items():
             missing.note(own.dtype, name, reason)
@@ -248,14 +223,9 @@ class Recording:
         world: str | None = None,
         simulated: bool = False,
         thought_by: NodeReference | None = None,
-        strict: bool = False,
     ) -> openings.EpisodeOpening:
-        """Check the arguments of an episode. A plan or description that is too long is cut later; `strict` refuses it.
-
-        Raises `CallerError`.
-        """
-        openings.check_arguments(description=description, plan=plan, seed=seed, strict=strict)
-        openings.check_arguments(description=world, plan=None, seed=None, strict=False)
+        """Check the arguments of an episode; texts that are too long are cut later. Raises `CallerError`."""
+        openings.check_arguments(seed, plan=plan, description=description, world=world)
         if thought_by is not None and not _is_whole(thought_by):
             raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
         return openings.EpisodeOpening(
@@ -265,17 +235,6 @@ class Recording:
     def note_fault(self, where: str, error: BaseException) -> None:
         """Count a fault of an integration in `Memory.status`; log the 1st, 2nd, 4th, 8th and so on. Raises nothing."""
         self.emitter.note_fault(where, error)
-
-
-def _arguments(
-    kind: RecordedKind,
-    dtype: str,
-    fields: Mapping[str, declarations.FieldSpec],
-    bases: Sequence[str],
-    concept: str | None = None,
-    aliases: Sequence[str] = (),
-) -> _Arguments:
-    return kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases)
 
 
 def _identity(id: object) -> EpisodeId:  # noqa: A002  the argument's name

@@ -420,18 +420,7 @@ def _limit_items(holder: Any, items: Iterable[Any]) -> Iterable[Any]:
     """Return the items of a container. Raises `UnrecordableValue` if there are more than `ITEMS_MAX`."""
     if len(holder) > ITEMS_MAX:
         raise UnrecordableValue(f"it holds {len(holder):,} items, at most {ITEMS_MAX:,} are allowed")
-    return items if type(holder) in _BUILT_IN_CONTAINERS else _stop_at_limit(items)
-
-
-_BUILT_IN_CONTAINERS = (list, tuple, dict)
-"""Types whose `len` bounds their iteration; a user's own class may yield items without end."""
-
-
-def _stop_at_limit(items: Iterable[Any]) -> Iterator[Any]:
-    for number, each in enumerate(items):
-        if number == ITEMS_MAX:
-            raise UnrecordableValue(f"it holds more than {ITEMS_MAX:,} items")
-        yield each
+    return items
 
 
 # === values without a declared type ===========================================================================
@@ -646,14 +635,11 @@ class _Brief(Repr):
 
     def __init__(self) -> None:
         super().__init__()
+        self.maxlevel = 3
         self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = self.maxdict = 20
         self.maxother = self.maxlong = self.maxstring = 2 * _REPR_MAX
-        self._left = _REPR_MAX  # a part takes at least one character, so more parts would be cut off anyway
 
     def repr1(self, x: Any, level: int) -> str:
-        self._left -= 1
-        if self._left < 0:
-            return "…"
         try:
             if isinstance(x, str) and type(x).__repr__ is str.__repr__:
                 return repr(str.__getitem__(x, slice(_TEXT_MAX))) + _cut_mark(str.__len__(x), "characters")
@@ -680,10 +666,6 @@ _GROUP_MAX = 100
 """Bounds the recorded exceptions of one exception group."""
 
 
-_ARGS: Final = BaseException.__dict__["args"].__get__
-"""Reads the arguments of an exception, also of a class that replaces `args` by a property."""
-
-
 class FailureCopies:
     """Copies exceptions for one episode. An exception that several nodes raise on its way up is copied once.
 
@@ -698,9 +680,9 @@ class FailureCopies:
         self, failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
     ) -> event_types.FailureValue:
         """Copy class, message and arguments of an exception. Raises no `Exception`."""
-        if not issubclass(type(failure), BaseException):  # whatever an executive gave, which may deny its class
+        if not isinstance(failure, BaseException):  # whatever an executive gave
             return failure_value(failure, references, convert)
-        arguments, message = _ARGS(failure), message_of(failure)
+        arguments, message = failure.args, message_of(failure)
         if self._last is not None:
             copied, former_arguments, former_message, value = self._last
             if copied() is failure and former_arguments is arguments and former_message == message:
@@ -723,35 +705,25 @@ def failure_value(
 ) -> event_types.FailureValue:
     """Copy class, message and converted arguments of an exception. Raises no `Exception`."""
     return event_types.FailureValue(
-        type=cut(_path_of(type(failure)), _FAILURE_NAME_MAX),
+        type=_name_of(failure),
         message=cut(clean(message_of(failure)), _MESSAGE_MAX),
-        arguments=_arguments_or_missing(failure, references, convert),
+        arguments=_arguments(failure, references, convert, 0),
     )
 
 
-def _path_of(kind: type) -> str:
-    try:
-        return clean(recorded_name(kind))
-    except Exception as error:  # noqa: BLE001  a metaclass may raise anything
-        return f"<an exception whose class has no name: {type(error).__name__}>"
-
-
-def _arguments_or_missing(failure: BaseException, references: References, convert: Callable[[Any], Any]) -> list[Any]:
-    try:
-        return _arguments(failure, references, convert, 0)
-    except Exception as error:  # noqa: BLE001  `args` may be a property that raises anything
-        return [event_types.MissingValue(reading_fault(error))]
+def _name_of(failure: BaseException) -> str:
+    return cut(clean(recorded_name(type(failure))), _FAILURE_NAME_MAX)
 
 
 def _arguments(failure: BaseException, references: References, convert: Callable[[Any], Any], depth: int) -> list[Any]:
     """Encode the arguments of an exception; for a group, its message and the encoded exceptions inside it."""
     if not isinstance(failure, BaseExceptionGroup):
-        return [encode_or_missing(convert(each), references) for each in failure.args]
+        return [encode_or_missing(convert(each), references) for each in getattr(failure, "args", ())]
     if depth > DEPTH_MAX:
         return [missing_value(f"it is nested more than {DEPTH_MAX} deep", failure)]
     inside = [
         {
-            "type": cut(_path_of(type(each)).rpartition(".")[2], _FAILURE_NAME_MAX),
+            "type": _name_of(each).rpartition(".")[2],
             "message": cut(clean(message_of(each)), REASON_MAX),
             "arguments": _arguments(each, references, convert, depth + 1),
         }

@@ -27,7 +27,6 @@ from pycrorm_async.record.declarations import Declared, FieldSpec, KnownTypes, d
 from pycrorm_async.record.plan_types import Declarations, built_in_declaration, declared_type
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Pose
-from tests.commands import pycrorm
 from tests.databases import ask
 from tests.record.recordings import assert_verified, events, nodes, url_of
 
@@ -123,19 +122,6 @@ def test_a_field_without_a_column_is_refused_by_name_and_type(kind: Any) -> None
     made: type[ActionAbstract] = dataclass(type("OddActionPerformable", (ActionAbstract,), namespace))
     with pytest.raises(DeclarationRefused, match="field 'odd' has the type"):
         declared_type(made)
-
-
-def test_a_reserved_name_gets_an_underscore() -> None:
-    @dataclass
-    class ReservedActionPerformable(ActionAbstract):
-        robot_state: str
-
-        async def perform(self) -> None:
-            """Succeed without doing anything."""
-
-    declared = declared_type(ReservedActionPerformable)
-    assert declared.declaration.fields == (FieldDeclared("robot_state_", "robot_state_", "text", 2),)
-    assert [(each.name, each.path) for each in declared.fields] == [("robot_state_", ("robot_state",))]
 
 
 def test_a_class_with_fields_that_is_no_dataclass_is_refused() -> None:
@@ -372,6 +358,8 @@ def test_a_field_that_contradicts_a_built_in_type_is_kept_under_its_type(tmp_pat
     assert ask(tmp_path / "memory.db", columns) == [("milk", "LEFT", 1.5)]
     (declared,) = events(tmp_path, "NodeStarted")[1:]
     assert declared["parameters"] == {"object_designator_text": "milk", "arm": "LEFT", "grasp_real": 1.5}
+    concept = "SELECT payload ->> 'concept' FROM pycrorm_declaration"
+    assert ask(tmp_path / "memory.db", concept) == [("PickingUp",)]
 
 
 def test_each_memory_searches_the_classes_for_a_built_in_type_once() -> None:
@@ -392,59 +380,6 @@ def test_a_type_is_declared_when_it_is_asked_for_and_has_a_table_without_a_node(
     assert declared_dtypes(tmp_path) == ["Wipe"]
     assert ask(tmp_path / "memory.db", "SELECT surface FROM wipe") == []
     assert_verified(tmp_path)
-
-
-def test_a_prepared_type_is_declared_when_it_is_asked_for_as_one_that_was_not_prepared(tmp_path: Path) -> None:
-    fields: Mapping[str, FieldSpec] = {"arm": "integer", "grasp": "text", "surface": "pose", "_private": "real"}
-    declared = []
-    for folder, kinds in (("plain", ()), ("prepared", ("PickUpAction", "Wipe", "Unused"))):
-        (tmp_path / folder).mkdir()
-        with Memory.sync(url_of(tmp_path / folder), settings=AT_END) as memory:
-            with memory.recording.episode(description="d"):
-                for each in kinds:
-                    memory.recording.prepare("action", each, fields, bases=("Move",))
-                assert memory.status.missing.total == 0
-                types = [
-                    memory.recording.type("action", each, fields, bases=("Move",)) for each in ("PickUpAction", "Wipe")
-                ]
-                paths = [[(each.name, each.path) for each in declared_kind.fields] for declared_kind in types]
-                declared.append(([each.payload for each in types], paths, memory.status.missing))
-            assert memory.status.faults == (0, None)
-        assert declared_dtypes(tmp_path / folder) == ["PickUpAction", "Wipe"]
-        assert_verified(tmp_path / folder)
-    assert declared[0] == declared[1]
-
-
-def test_a_type_declared_after_another_was_prepared_keeps_its_table_and_columns(tmp_path: Path) -> None:
-    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
-        recording = memory.recording
-        with recording.episode(description="d"):
-            recording.prepare("action", "Wipe", {"side": "text"})
-            recording.prepare("action", "PourAction", {"cup": "text"})
-            recording.type("action", "Wipe", {"side": "real"})
-            recording.type("action", "pourAction", {"cup": "text"})
-            wipe = recording.type("action", "Wipe", {"side": "text"})
-            pour = recording.type("action", "PourAction", {"cup": "text"})
-        assert [each.name for each in wipe.fields] == ["side_text"]
-        assert (pour.dtype, pour.declaration.table) == ("PourActionAction", "pour_action_action")
-        assert memory.status.faults == (0, None)
-    assert_verified(tmp_path)
-
-
-def test_preparing_a_type_of_the_same_table_as_another_reserves_no_name(tmp_path: Path) -> None:
-    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
-        memory.recording.prepare("action", "PickUpAction", {"arm": "text"})
-        declared = memory.recording.type("action", "pickUpAction", {"arm": "integer"})
-        assert (declared.dtype, declared.declaration.table) == ("pickUpAction", "pick_up_action")
-        assert [each.name for each in declared.fields] == ["arm"]
-    assert declared_dtypes(tmp_path) == ["pickUpAction"]
-
-
-def test_a_type_that_cannot_be_prepared_is_counted_and_does_not_reach_the_caller(tmp_path: Path) -> None:
-    unhashable: Any = {"side": []}
-    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
-        memory.recording.prepare("action", "Wipe", unhashable)
-        assert memory.status.faults[0] == 1
 
 
 def test_threads_that_ask_for_one_type_at_once_get_one_declaration(tmp_path: Path) -> None:
@@ -470,14 +405,6 @@ def test_threads_that_ask_for_one_type_at_once_get_one_declaration(tmp_path: Pat
         spooled = memory.status.written
     assert {id(each) for each in declared} == {id(declared[0])}
     assert spooled == 3, "the start of the episode and of its root, and one declaration"
-
-
-def test_a_built_in_type_keeps_its_concept_and_bases(tmp_path: Path) -> None:
-    recorded(tmp_path, "PickUpAction", {"arm": str}, {"arm": "LEFT"})
-    ((payload,),) = ask(
-        tmp_path / "memory.db", "SELECT payload FROM pycrorm_declaration WHERE payload LIKE '%PickUpAction%'"
-    )
-    assert json.loads(payload)["concept"] == "PickingUp"
 
 
 def test_a_field_that_contradicts_an_earlier_declaration_is_kept_under_its_type(tmp_path: Path) -> None:
@@ -508,22 +435,25 @@ async def test_a_field_that_contradicts_a_class_of_the_plan_layer_is_kept_under_
     assert rows == [("hello", None), (None, 1.0)]
 
 
-@pytest.mark.parametrize(
-    ("field", "kept"),
-    [
-        ("id", "id_"),
-        ("object", "object_"),
-        ("target frame", "target_frame"),
-        ("2nd", "field_2nd"),
-        ("_x", "x"),
-        ("é", "é"),
-        ("Ω-1", "Ω_1"),
-    ],
-)
-def test_a_field_whose_name_cannot_be_a_column_gets_a_similar_one(tmp_path: Path, field: str, kept: str) -> None:
-    counted = kept not in (field, f"{field}_")
-    assert recorded(tmp_path, "Odd", {field: "text", "plain": "text"}, {field: "a", "plain": "b"}) == counted
-    assert ask(tmp_path / "memory.db", f'SELECT "{kept}", plain FROM odd') == [("a", "b")]
+def test_a_field_whose_name_cannot_be_a_column_gets_a_similar_one(tmp_path: Path) -> None:
+    reserved = {"id": "id_", "object": "object_"}
+    similar = {"target frame": "target_frame", "2nd": "field_2nd", "_x": "x", "Ω-1": "Ω_1"}
+    kept = {**reserved, **similar, "é": "é", "plain": "plain"}
+    assert recorded(tmp_path, "Odd", dict.fromkeys(kept, "text"), {name: f"a {name}" for name in kept}) == len(similar)
+    columns = ", ".join(f'"{each}"' for each in kept.values())
+    assert ask(tmp_path / "memory.db", f"SELECT {columns} FROM odd") == [tuple(f"a {name}" for name in kept)]
+
+
+def test_a_type_whose_name_cannot_be_a_table_gets_a_similar_one(tmp_path: Path) -> None:
+    kept = {"Say it!": "Say_it", "__start__": "start", "Event": "EventAction", "": "Unnamed", "7": "action_7"}
+    for dtype in kept:
+        assert recorded(tmp_path, dtype, {"text": "text"}, {"text": "hi"}) == 1
+    assert [dtype for dtype, *_ in nodes(tmp_path)] == [*kept.values()]
+
+
+def test_a_node_of_a_type_that_cannot_be_declared_has_no_type(tmp_path: Path) -> None:
+    assert recorded(tmp_path, "MoveTCPMotion", {}, {}) == 1  # it is a motion, not an action
+    assert nodes(tmp_path) == [(None, None, "SUCCEEDED", None)]
 
 
 def test_a_seam_keeps_a_reserved_name_as_designators_do_and_an_older_memory_as_it_began(tmp_path: Path) -> None:
@@ -535,15 +465,6 @@ def test_a_seam_keeps_a_reserved_name_as_designators_do_and_an_older_memory_as_i
     assert ask(tmp_path / "memory.db", "SELECT kind__, Kind___, kind_ FROM even") == [("a", 1.5, "b")]
 
 
-@pytest.mark.parametrize(
-    ("dtype", "kept"),
-    [("Say it!", "Say_it"), ("__start__", "start"), ("Event", "EventAction"), ("", "Unnamed"), ("7", "action_7")],
-)
-def test_a_type_whose_name_cannot_be_a_table_gets_a_similar_one(tmp_path: Path, dtype: str, kept: str) -> None:
-    assert recorded(tmp_path, dtype, {"text": "text"}, {"text": "hi"}) == 1
-    assert nodes(tmp_path)[0][0] == kept
-
-
 def test_values_of_fields_without_a_type_are_missing_with_the_reason(tmp_path: Path) -> None:
     fields: dict[str, Any] = {"thing": object, "kind": "colour", "number": int}
     values = {"thing": 1, "kind": "red", "number": "no number", "undeclared": 4}
@@ -551,10 +472,3 @@ def test_values_of_fields_without_a_type_are_missing_with_the_reason(tmp_path: P
     (started,) = [each for each in events(tmp_path, "NodeStarted") if "designator" in each]
     assert all("missing" in each for each in started["parameters"].values())
     assert started["parameters"]["number"]["missing"] == "declared as int, got a str"
-
-
-@pytest.mark.slow
-def test_a_node_of_a_type_that_cannot_be_declared_is_shown_as_its_kind(tmp_path: Path) -> None:
-    assert recorded(tmp_path, "MoveTCPMotion", {}, {}) == 1  # it is a motion, not an action
-    assert nodes(tmp_path) == [(None, None, "SUCCEEDED", None)]
-    assert "── action  SUCCEEDED" in pycrorm("show", "last", "--url", url_of(tmp_path), cwd=tmp_path).stdout

@@ -92,25 +92,3 @@ async def test_all_readers_count_failures_by_the_same_reasons(database_url: str,
         assert dict((await Recall.of(reading)("DriveAction", k=100)).reasons) == expected
         statuses = Counter(each.status for each in await reading.tree(await reading.episode("1")))
         assert statuses == {"FAILED": len(CAUSES) - 1, "ERROR": 1, "SUCCEEDED": 1}
-
-
-def test_the_feedback_of_a_behaviour_is_its_reason(tmp_path: Path) -> None:
-    py_trees = pytest.importorskip("py_trees")
-    from pycrorm_async.integrations.py_trees import RememberedTree
-
-    class Grip(py_trees.behaviour.Behaviour):  # type: ignore[misc, name-defined]  # py_trees is not checked
-        turns = 0
-
-        def update(self) -> Any:
-            self.turns += 1
-            self.feedback_message = f"grip force {self.turns} N is too low" if self.turns % 2 else "fingers stuck"
-            return py_trees.common.Status.FAILURE
-
-    tree = py_trees.trees.BehaviourTree(Grip("hand"))
-    with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
-        with RememberedTree(tree, memory.recording):
-            for _ in range(4):
-                tree.tick()
-        memory.flush()
-        rows = memory.ask.failures_by_cause().rows()
-    assert {each.reason for each in rows} == {"grip force # N is too low", "fingers stuck"}

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import keyword
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from sqlalchemy import column, select, table
 from sqlalchemy.orm import undefer
 
 from pycrorm_async import Memory, performable_of
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.codec import Record, declaration_of, decode
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.fields import RESERVED_COLUMNS
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, NodeStarted
@@ -36,7 +32,6 @@ from pycrorm_async.recall.columns import RESERVED
 from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.recording import Recording
-from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.contracts import check_designator
@@ -314,88 +309,6 @@ async def test_check_designator_compares_a_field_with_a_reserved_name(tmp_path: 
 
 # --- what the recorder writes can be decoded ----------------------------------------------------------------------
 
-_NAMES = st.one_of(
-    st.sampled_from(["kind", "dtype", "concept", "aliases", "orm_class", "id"]),
-    st.sampled_from(NAMES),
-    st.from_regex(r"[a-zA-Zäé][a-zA-Z0-9_]{0,70}", fullmatch=True),
-).filter(lambda name: not keyword.iskeyword(name) and name not in _METHODS)
-_SCALARS = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.sampled_from(["action", "motion", "root", "language"]),
-    st.text(st.characters(), max_size=8), st.binary(max_size=4), st.just(object()),
-)  # fmt: skip
-_ANY_VALUE = st.one_of(
-    _SCALARS, st.lists(_SCALARS, max_size=2), st.dictionaries(st.text(max_size=3), _SCALARS, max_size=2)
-)
-_FIELDS = st.dictionaries(
-    _NAMES, st.tuples(st.sampled_from([bool, int, str, float, list[str], Any]), _ANY_VALUE), max_size=6
-)
-
-
-_Fields: TypeAlias = Mapping[str, tuple[Any, Any]]
-"""Type and value of each field."""
-_Make: TypeAlias = Callable[[str, _Fields], ActionAbstract]
-
-
-def _with_defaults(name: str, fields: _Fields) -> ActionAbstract:
-    return _dataclass(name, [(each, hint, _default(value)) for each, (hint, value) in fields.items()])()
-
-
-def _default(value: Any) -> Any:
-    return dataclasses.field(default_factory=lambda: value) if isinstance(value, list | dict) else value
-
-
-def _without_defaults(name: str, fields: _Fields) -> ActionAbstract:
-    made = _dataclass(name, [(each, hint) for each, (hint, _) in fields.items()])
-    return made(**{each: value for each, (_, value) in fields.items()})
-
-
-def _dataclass(name: str, fields: list[Any]) -> Callable[..., ActionAbstract]:
-    namespace = {"perform": _nothing, "__module__": __name__}
-    return make_dataclass(name, fields, bases=(ActionAbstract,), namespace=namespace)
-
-
-def _with_attributes(name: str, fields: _Fields) -> ActionAbstract:
-    def initialise(self: Any, **options: Any) -> None:
-        vars(self).update(options)
-
-    made = type(name, (ActionAbstract,), {"perform": _nothing, "__init__": initialise, "__module__": __name__})
-    performable: ActionAbstract = made(**{each: value for each, (_, value) in fields.items()})
-    return performable
-
-
-_DESIGNATORS = st.lists(
-    st.tuples(st.sampled_from([_with_defaults, _without_defaults, _with_attributes]), _FIELDS), min_size=1, max_size=5
-)
-
-
-@settings(max_examples=15)
-@given(_DESIGNATORS)
-def test_every_event_that_the_recorder_writes_can_be_decoded(designators: list[tuple[_Make, _Fields]]) -> None:
-    async def record(url: str) -> None:
-        async with Memory.open(url, settings=Settings(fold="at_end")) as memory:
-            async with memory.episode(description="any fields"):
-                for number, (make, fields) in enumerate(designators):
-                    await make(f"Own{number}Action", fields).perform()
-            with memory.recording.episode() as episode:
-                for number, (_, fields) in enumerate(designators):
-                    hints, values = ({name: each[place] for name, each in fields.items()} for place in (0, 1))
-                    declared = memory.recording.type("action", f"Other{number}Action", hints)
-                    episode.start("node", declared, values)
-                    episode.end("node", result=values)
-            await memory.flush()  # raises `EpisodeParked` if an event cannot be folded
-            assert not memory.status.faults.total
-
-    with tempfile.TemporaryDirectory() as folder:
-        url = put_memory(Path(folder) / "memory.db")
-        asyncio.run(record(url))
-        declared = [declaration_of(each.encode()) for (each,) in ask(url, "SELECT payload FROM pycrorm_declaration")]
-        events = ask(url, "SELECT type, payload, version FROM event ORDER BY episode, sequence")
-    dtypes = [f"{executive}{number}Action" for executive in ("Own", "Other") for number in range(len(designators))]
-    assert sorted((each.kind, each.dtype) for each in declared) == sorted(("action", each) for each in dtypes)
-    decoded = [decode(type_name, payload.encode(), version) for type_name, payload, version in events]
-    kinds = [each.kind for each in decoded if isinstance(each, NodeStarted)]
-    assert kinds == ["root", *["action"] * len(designators)] * 2
-
 
 # --- events of earlier versions -----------------------------------------------------------------------------------
 
@@ -441,12 +354,6 @@ async def test_events_with_a_field_of_the_user_in_place_of_kind_or_concept_are_f
 
 def _stamped(events: list[tuple[str, bytes]]) -> Iterator[tuple[str, int, int, int, bytes]]:
     return ((name, 1, at, at, payload) for at, (name, payload) in enumerate(events, 1))
-
-
-@pytest.mark.parametrize("payload", [b"{}", b"[]", b'{"kind":"water","parent":"x"}', b'{"kind":"action","parent":"x"}'])
-def test_a_start_with_another_fault_is_still_refused(payload: bytes) -> None:
-    with pytest.raises(ValueError, match=r"(missing|Expected)"):
-        decode("NodeStarted", payload)
 
 
 def test_half_of_a_surrogate_pair_in_a_name_or_concept_keeps_neither_the_type_nor_its_values_from_being_recorded(

@@ -7,7 +7,6 @@ import decimal
 import enum
 import logging
 import math
-from collections.abc import Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,14 +20,12 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, Happening, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.record import values as missing_values
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models import built_in_urdf
-from tests.memory.note_actions import NoteActionPerformable as RememberedNoteAction
 from tests.record.fakes import NoteActionPerformable, findings, recorder_case
 
 
@@ -92,16 +89,6 @@ class RaisingAny:
         return "raising"
 
 
-class Endless(Sequence[int]):
-    """A value with a false length."""
-
-    def __len__(self) -> int:
-        return 3
-
-    def __getitem__(self, index: Any) -> Any:
-        return index
-
-
 class Foreign(enum.Enum):
     """A member of another enum than the declared one, whose names cannot be recorded."""
 
@@ -113,18 +100,6 @@ def circle() -> list[Any]:
     round_: list[Any] = []
     round_.extend([round_] * 10)
     return round_
-
-
-class RaisingFailure(Exception):
-    @property
-    def args(self) -> Any:
-        raise ZeroDivisionError
-
-    @args.setter
-    def args(self, _: object) -> None: ...
-
-    def __str__(self) -> str:
-        raise ZeroDivisionError
 
 
 LONG_NAMED = type("Long" * 30_000, (Exception,), {"__module__": "\ud800"})
@@ -148,7 +123,7 @@ VALUES = st.recursive(
     lambda each: st.lists(each, max_size=4) | st.dictionaries(st.text(), each, max_size=4),
     max_leaves=6,
 )
-FAILURES = st.tuples(st.sampled_from([ValueError, RaisingFailure, LONG_NAMED, ExceptionGroup]), NASTY)
+FAILURES = st.tuples(st.sampled_from([ValueError, LONG_NAMED, ExceptionGroup]), NASTY)
 
 
 def meant(value: Any) -> Any:
@@ -182,7 +157,7 @@ def started(events: list[tuple[int, Happening]]) -> NodeStarted:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bytes_max", [pytest.param(2**20, marks=pytest.mark.soak), 3_000])
+@pytest.mark.parametrize("bytes_max", [pytest.param(2**20, marks=pytest.mark.soak), 2**14])
 @given(described=VALUES, fails=st.none() | FAILURES)
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_memory_does_not_change_the_behaviour_of_a_plan(
@@ -366,21 +341,6 @@ async def test_of_two_worlds_in_one_episode_only_the_first_is_recorded(
 # A value that cannot be recorded is missing in the tables, all others are there, and no plan stops.
 
 
-@dataclass
-class SurveyActionPerformable(ActionAbstract):
-    """A designator with one recordable field among others that are not."""
-
-    text: str
-    weight: float
-    photo: bytes
-    tags: set[str]
-    nowhere: Nowhere  # type: ignore[name-defined]  # noqa: F821  the fault here
-    count: int = 3
-
-    async def perform(self) -> bytes:
-        return self.photo
-
-
 class HailActionPerformable(ActionAbstract):
     """A designator that is no dataclass: its fields are the parameters of its constructor."""
 
@@ -397,47 +357,6 @@ class BellowActionPerformable(HailActionPerformable):
     def __init__(self, volume: float, **options: Any) -> None:
         super().__init__(**options)
         self.volume = volume
-
-
-@dataclass
-class PoseActionPerformable(ActionAbstract):
-    """A designator whose table would have the name of one of the memory's own."""
-
-    dtype = "Pose"
-    text: str
-
-    async def perform(self) -> None:
-        await RememberedNoteAction(self.text).perform()
-
-
-@pytest.mark.slow
-@pytest.mark.soak_on("postgresql")
-async def test_an_unrecordable_value_is_null_and_all_others_are_in_the_tables(
-    database_url: str, tmp_path: Path
-) -> None:
-    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
-        async with memory.episode(description="d" * 20_000):
-            photo = b"\xff" * 2**21
-            assert await SurveyActionPerformable("a\x00b", math.inf, photo, {"x"}, object()).perform() is photo
-            await SurveyActionPerformable("x" * 2**21, 2.5, b"", set(), None).perform()
-            await SurveyActionPerformable("fine", 1.5, b"", set(), None, count=2**70).perform()
-            await PoseActionPerformable("below").perform()
-        await memory.flush()
-        assert memory.status.faults.total == 0, memory.status.faults.last
-        assert memory.status.missing.total == 16
-        surveys: Any = memory.mapped(SurveyActionPerformable)
-        async with memory.session() as session:
-            rows = (
-                await session.execute(select(surveys.text, surveys.weight, surveys.count).order_by(surveys.id))
-            ).all()
-            (episode,) = (await session.scalars(select(ProcessMetaData))).all()
-            nodes = (await session.scalars(select(TaskTreeNode).order_by(TaskTreeNode.id))).all()
-    assert [tuple(row) for row in rows] == [(None, None, 3), (None, 2.5, 3), ("fine", 1.5, None)]
-    assert episode.description == "d" * 10_000 + "… (20,000 characters)"
-    assert episode.status == "SUCCEEDED"
-    assert [(node.dtype, node.status.name) for node in nodes[-2:]] == [(None, "SUCCEEDED"), ("NoteAction", "SUCCEEDED")]
-    assert nodes[-1].parent is not None
-    assert nodes[-1].parent.id == nodes[-2].id
 
 
 @pytest.mark.slow

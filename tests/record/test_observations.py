@@ -28,7 +28,6 @@ from pycrorm_async.plan import (
     ChosenRobot,
     DetectingMotion,
     ObjectDesignator,
-    SimulatedTaskTree,
 )
 from pycrorm_async.plan.execution import Seen
 from pycrorm_async.plan.motions import SimulatedModules
@@ -455,50 +454,17 @@ async def test_a_percept_keeps_its_pose_confidence_and_source_and_needs_no_objec
     assert differences(live, tables_of(copied)) == []
 
 
-async def test_a_confidence_of_numpy_and_names_that_no_database_accepts_are_recorded(tmp_path: Path) -> None:
+async def test_of_a_percept_what_cannot_be_recorded_is_left_out(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         async with memory.episode(description="perceived"):
-            await perceive(guessed("a\0b", confidence=np.float32(0.25), source="s\0\ud800"))
-        ((_, name, _, _, _, _, confidence, source),) = await rows(memory)
-        assert (name, confidence) == ("a\\x00b", 0.25)
-        assert source == "s\\x00\\ud800"
-
-
-async def test_numbers_that_are_not_finite_affect_no_other_percept(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
-        async with memory.episode(description="perceived"):
-            await perceive(
-                guessed("a", confidence=math.nan), guessed("b", visible=math.inf), guessed("c", confidence=0.5)
-            )
+            number = np.float32(0.25)
+            await perceive(guessed("a\0b", confidence=number, source="s\0\ud800"), guessed("b", visible=math.inf))
         detections = await rows(memory)
-        assert [(each[1], each[5], each[6]) for each in detections] == [
-            ("a", None, None), ("b", None, None), ("c", None, 0.5),
-        ]  # fmt: skip
+        assert [(each[1], *each[5:]) for each in detections] == [
+            ("a\\x00b", None, 0.25, "s\\x00\\ud800"),
+            ("b", None, None, "camera"),
+        ]
         assert memory.status.missing.total == 1
-
-
-async def test_too_many_percepts_for_an_event_are_left_out_as_a_whole_and_counted(tmp_path: Path) -> None:
-    settings = Settings(record_bytes_max=4096)
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
-        async with memory.episode(description="perceived"):
-            await perceive(*(guessed(f"cup {n}", confidence=1 / (n + 1), source="stereo") for n in range(64)))
-        assert await rows(memory) == []
-        missing = memory.status.missing
-        assert (missing.total, str(missing.last).partition(" takes")[0]) == (1, "ObjectDetected.seen:")
-        assert memory.status.faults.total == 0
-
-
-async def test_a_percept_of_a_simulation_refers_to_the_object_of_the_simulation(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
-        async with memory.episode(description="perceived"):
-            with BulletWorld():
-                milk = Object("milk", MILK, pose=Pose([1.3, 1, 0.9]))
-                with SimulatedTaskTree():
-                    await perceive(Seen(milk, confidence=0.5), guessed("cup?", confidence=0.25))
-        assert await rows(memory) == []
-        assert [(each[1], each[3], each[6]) for each in await rows(memory, simulated=True)] == [
-            ("milk", "milk", 0.5), ("cup?", None, 0.25),
-        ]  # fmt: skip
 
 
 async def test_a_percept_of_another_class_is_refused_in_the_plan_and_counted(tmp_path: Path) -> None:

@@ -193,15 +193,6 @@ async def test_a_world_entered_before_belongs_to_each_open_episode() -> None:
     assert kinds(case.sink.of(second)).count("ObjectAttached") == 1
 
 
-async def test_successive_worlds_belong_to_the_same_episode() -> None:
-    with recorder_case() as case, case.episode() as episode:
-        for name in ("one", "two"):
-            with BulletWorld():
-                Object(name, ObjectType.MILK)
-    assert [e.name for _, e in case.sink.of(episode) if isinstance(e, ObjectAdded)] == ["one", "two"]
-    assert findings(case.sink.of(episode)) == []
-
-
 async def test_a_perform_outside_any_episode_opens_one_of_its_own() -> None:
     with recorder_case() as case:
         await NoteActionPerformable("a").perform()
@@ -473,19 +464,6 @@ async def test_a_full_spool_makes_the_start_wait_by_default() -> None:
         await task
         assert note.ran
     assert findings(case.sink.of(episode)) == []
-
-
-async def test_a_parameter_that_raises_when_it_is_read_is_refused_before_perform_runs() -> None:
-    class Heavy:
-        def __float__(self) -> float:
-            raise RuntimeError("too heavy")
-
-    with recorder_case(STRICT) as case, case.episode() as episode:
-        note = NoteActionPerformable("x", weight=Heavy())  # type: ignore[arg-type]
-        with pytest.raises(Unrecordable, match=r"NoteAction\.weight .* reading it raised RuntimeError: too heavy"):
-            await note.perform()
-        assert not note.ran
-    assert kinds(case.sink.of(episode)).count("NodeStarted") == 1
 
 
 async def test_a_start_that_fails_by_a_fault_of_the_recorder_leaves_no_episode_open() -> None:

@@ -49,9 +49,11 @@ def test_a_move_to_the_last_pose_writes_nothing_and_one_to_no_pose_is_counted(tm
         poses: list[Any] = [Pose([1, 2, 3]), Pose([1, 2, 4]), Pose([1, 2, 4]), (1, 2, 3), None]
         for each in poses:
             episode.object_moved("m", each)
+        episode.object_moved("never added", HERE)
+        episode.object_moved("m", poses[-1])
 
     total, last = faults_of(tmp_path, write)
-    assert total == 2
+    assert total == 4
     assert last is not None
     assert "expected a PoseValue, got None" in last
     assert [each["pose"]["position"] for each in events(tmp_path, "ObjectMoved")] == [[1.0, 2.0, 4.0]]
@@ -213,13 +215,6 @@ def test_values_go_through_the_conversion_and_what_it_refuses_is_missing_with_it
     assert_verified(tmp_path)
 
 
-def test_an_end_without_a_start_is_counted(tmp_path: Path) -> None:
-    total, last = faults_of(tmp_path, lambda _, episode: episode.end("never"))
-    assert total == 1
-    assert last is not None
-    assert "no open node has the key 'never'" in last
-
-
 def test_a_key_in_use_ends_its_first_node_lost_and_starts_the_second(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         kind = recording.type("action", "Twice")
@@ -316,30 +311,6 @@ def test_nodes_open_at_the_end_of_an_interrupted_episode_end_cancelled(
         episode.close(failure)
         assert memory.status.faults.total == 0
     assert [row[2] for row in nodes(tmp_path)] == [status] * 3
-    assert_verified(tmp_path)
-
-
-@pytest.mark.parametrize("misuse", ["unhashable", "no pose", "unknown object", "no type", "bad status"])
-def test_misuse_is_counted_and_never_raises(tmp_path: Path, misuse: str) -> None:
-    def write(recording: Recording, episode: RecordedEpisode) -> None:
-        anything: Any = []
-        if misuse == "unhashable":
-            episode.start(anything, recording.type("action", "Step"))
-        elif misuse == "no pose":
-            episode.object_added("m", "milk", "MILK", anything)
-        elif misuse == "unknown object":
-            episode.object_moved("m", HERE)
-        elif misuse == "no type":
-            episode.start("a", anything)
-        else:
-            episode.start("a", recording.type("action", "Step"))
-            episode.end("a", anything)
-
-    assert faults_of(tmp_path, write)[0] >= 1
-    with opened(tmp_path) as memory, memory.recording.episode(description="after it") as episode:
-        episode.start("a", memory.recording.type("action", "Step"))
-        episode.end("a")
-    assert nodes(tmp_path)[-1][2] == "SUCCEEDED"
     assert_verified(tmp_path)
 
 
@@ -478,18 +449,6 @@ def test_a_start_waits_until_the_spool_has_room_and_logs_that(
 # === recorded outcomes ========================================================================================
 #
 # The status of a recorded node and of its episode: stated by the executive, or that of the failure.
-
-
-def test_an_unknown_status_is_counted_and_the_node_ends_with_an_error(tmp_path: Path) -> None:
-    def write(recording: Recording, episode: RecordedEpisode) -> None:
-        episode.start(1, recording.type("action", "Step"))
-        episode.end(1, cast("Any", "DONE"))
-
-    total, last = faults_of(tmp_path, write)
-    assert total == 1
-    assert last is not None
-    assert "'DONE' is not a status" in last
-    assert [row[2] for row in nodes(tmp_path)] == ["ERROR"]
 
 
 def test_a_failure_that_leaves_the_block_ends_the_episode_with_its_status(tmp_path: Path) -> None:

@@ -85,6 +85,7 @@ async def test_a_simulation_is_an_episode_that_names_the_node_that_simulates() -
     with recorder_case() as case, case.episode() as real:
         await ThinkActionPerformable("thought").perform()
         assert current_episode.get() is real
+    assert (case.recorder.episodes.recent, case.recorder.episodes.opened_count) == ((str(real),), 1)
     (simulation,) = simulated_episodes(case)
     assert kinds(case.sink.of(real)) == [
         "EpisodeStarted", "NodeStarted", "NodeStarted", "NodeStarted", "NodeEnded", "NodeEnded", "NodeEnded",
@@ -113,15 +114,6 @@ async def test_a_simulation_outside_any_node_is_caused_by_the_root_and_without_a
     assert started(case, first).description == "what if"
     assert (started(case, second).thought_by, started(case, second).description) == (None, "simulation")
     assert len(case.sink.sequences) == 3
-
-
-async def test_a_simulation_in_an_implicit_episode_is_caused_by_that_episode() -> None:
-    with recorder_case() as case:
-        await ThinkActionPerformable("t").perform()
-    (simulation,) = simulated_episodes(case)
-    real = next(name for name in case.sink.sequences if name != simulation)
-    assert started(case, simulation).thought_by == NodeReference(episode_text(real), 3)
-    assert [each.parameters.get("text") for each in only(case.sink.of(real), NodeStarted)] == [None, "t", "real"]
 
 
 async def test_a_simulation_has_the_copy_as_its_world_and_the_episode_the_real_one() -> None:
@@ -304,29 +296,3 @@ async def test_a_simulation_whose_start_fails_by_a_fault_of_the_recorder_leaves_
     assert [each.kind for each in only(case.sink.of(simulated_alone), NodeStarted)] == ["root", "action", "motion"]
     assert [each.parameters.get("text") for each in only(case.sink.of(real), NodeStarted)] == [None, "real"]
     assert only(case.sink.of(real), ObjectMoved) == []
-
-
-async def test_a_simulation_whose_end_cannot_be_written_continues_as_without_a_memory() -> None:
-    with recorder_case() as case, case.episode() as real:
-        with SimulatedTaskTree():
-            case.sink.broken = True
-        case.sink.broken = False
-        await NoteActionPerformable("real").perform()
-        assert current_episode.get() is real
-    assert case.emitter.faults.total == 1
-
-
-async def test_simulations_are_not_among_the_recent_episodes() -> None:
-    with recorder_case() as case:
-        with case.episode() as real, SimulatedTaskTree():
-            pass
-        assert case.recorder.episodes.recent == (str(real),)
-        assert case.recorder.episodes.opened_count == 1
-        assert case.recorder.episodes.all == ()
-
-
-async def test_a_description_that_is_too_long_is_cut() -> None:
-    with recorder_case() as case, SimulatedTaskTree("x" * 20_000):
-        pass
-    (simulation,) = simulated_episodes(case)
-    assert started(case, simulation).description == "x" * 10_000

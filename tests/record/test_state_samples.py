@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import contextvars
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory
 from pycrorm_async.clock import monotonic_ns
-from pycrorm_async.errors import CallerError
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.types import Happening, NodeEnded, NodeStarted, StateSampled
 from pycrorm_async.orm import Object as ObjectRow
@@ -309,24 +307,6 @@ def case() -> Iterator[RecorderCase]:
 # The sampler follows the robot, the simulation and the episode of a motion, and ends with all of them.
 
 
-async def test_another_robot_begins_with_every_channel(case: RecorderCase) -> None:
-    async def drive(body: Object, target: Pose) -> None:
-        body.set_pose(target)
-        await seen(case, "base.x", target.position.x)
-        body.remove()
-        other = Object("pr2", ObjectType.ROBOT, pose=Pose([8, 8, 0]))
-        await seen(case, "base.x", 8.0)
-        other.set_pose(Pose([9, 8, 0]))
-
-    with case.episode(), ChosenRobot("mine", Robot(drive)):
-        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    result = samples(case)
-    objects = [each.object.object for each in result]
-    assert [len(each.channels) > len(BASE) for each in result] == [True, False, True, False]
-    assert objects[0] == objects[1] != objects[2] == objects[3]
-    assert result[3].channels == {"base.x": 9.0}
-
-
 @dataclass
 class ThinkActionPerformable(ActionAbstract):
     async def perform(self) -> None:
@@ -365,21 +345,6 @@ async def test_a_motion_that_outlives_its_episode_is_not_sampled_afterwards(case
     assert values(case, "base.x") == [0.0, 0.25]
 
 
-async def test_without_a_robot_or_a_world_no_samples_are_taken_and_no_thread_runs() -> None:
-    async def drive(*_: object) -> None: ...
-
-    class Bodiless(Robot):
-        async def navigate(self, motion: MoveMotion) -> None: ...
-
-    with recorder_case(SAMPLED) as case, ChosenRobot("mine", Bodiless(drive)):
-        with case.episode():
-            await MoveMotion(Pose()).perform()
-        with case.episode(), BulletWorld():
-            await MoveMotion(Pose()).perform()
-        assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
-        assert samples(case) == []
-
-
 async def test_a_thread_samples_only_on_request_and_ends_with_the_memory() -> None:
     def threads() -> list[str]:
         return [each.name for each in threading.enumerate() if each.name == "pycrorm sampler"]
@@ -392,73 +357,6 @@ async def test_a_thread_samples_only_on_request_and_ends_with_the_memory() -> No
             assert threads() == running
             assert bool(samples(case)) is bool(running)
         assert threads() == []
-
-
-class Interrupting(Object):
-    """At its first reading in the sampler's thread, the collector closes the plan that moves this robot."""
-
-    def __init__(self) -> None:
-        self.close: Callable[[], None] | None = None
-        self.closed = asyncio.Event()
-        super().__init__("pr2", ObjectType.ROBOT)
-
-    def joint_positions(self) -> dict[str, float]:
-        if self.close is not None and threading.current_thread().name == "pycrorm sampler":
-            close, self.close = self.close, None
-            close()
-        return super().joint_positions()
-
-
-async def test_a_motion_that_ends_during_its_own_sample_has_none_after_its_end() -> None:
-    """The collector, which may run in any thread, closes an abandoned plan like this."""
-    with recorder_case(SAMPLED) as case, BulletWorld():
-        robot = Interrupting()
-        with case.episode() as episode:
-            driving, ended = threading.Event(), threading.Event()
-
-            async def drive(_body: Object, _target: Pose) -> None:
-                driving.set()
-                await Suspended()
-
-            with ChosenRobot("mine", Robot(drive)):
-                dropped = MoveMotion(Pose([1, 0, 0])).perform()
-                context = contextvars.copy_context()
-                while not driving.is_set():  # the hook may let the loop run first
-                    context.run(dropped.send, None)
-            robot.set_pose(Pose([0.5, 0, 0]))
-
-            def close() -> None:
-                robot.set_pose(Pose([0.75, 0, 0]))
-                dropped.close()
-                ended.set()
-
-            robot.close = close
-            assert await asyncio.to_thread(ended.wait, 10)
-            await asyncio.sleep(0.01)
-            events = [type(event).__name__ for _, event in case.sink.of(episode)]
-        last_end = len(events) - 1 - events[::-1].index("NodeEnded")
-        assert "StateSampled" not in events[last_end:]
-        assert values(case, "base.x")[-1] == 0.75
-        assert case.emitter.faults.total == 0
-
-
-class Suspended:
-    """An await that never ends."""
-
-    def __await__(self) -> Generator[None, None, None]:
-        yield
-
-
-@pytest.mark.parametrize("interval", [0, -1, "5", float("nan")])
-def test_an_invalid_interval_is_refused(interval: object) -> None:
-    with pytest.raises(CallerError, match=r"sample_interval_ms is .*: it must be a number above zero"):
-        Settings(sample_interval_ms=interval)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("margin", [-0.1, float("nan"), float("inf"), None, "1"])
-def test_an_invalid_margin_is_refused(margin: object) -> None:
-    with pytest.raises(CallerError, match=r"sample_change_min is .*: it must be a number, zero or above"):
-        Settings(sample_change_min=margin)  # type: ignore[arg-type]
 
 
 # === state stream =============================================================================================
@@ -531,34 +429,6 @@ async def test_a_trajectory_is_recorded_with_its_values_and_times(tmp_path: Path
         # The value in force when the sample was written, or the one before or after if a step fell in between.
         so_far = sum(set_ns <= ns for set_ns, _ in robot.log)
         assert value in stations[max(0, so_far - 1) : so_far + 2]
-
-
-@pytest.mark.slow
-async def test_the_state_at_any_moment_is_the_last_written_value_of_each_channel(tmp_path: Path) -> None:
-    """Over several motions of several parts, the samples up to the end of a motion add up to the robot's state then."""
-    stood: list[dict[str, float]] = []
-    async with Memory.open(url_of(tmp_path), settings=Settings(sample_interval_ms=1)) as memory:
-        async with memory.episode(description="moving"):
-            with BulletWorld(), simulated_robot:
-                body = Object("pr2", ObjectType.ROBOT)
-                for round_ in range(1, 5):
-                    for moving in (
-                        NavigateActionPerformable(Pose([round_ / 8, -round_ / 3, 0])),
-                        MoveTorsoActionPerformable(round_ / 16),
-                    ):
-                        await moving.perform()
-                        x, y, z = body.pose.position
-                        stood.append({"base.x": x, "base.y": y, "base.z": z, **body.joint_positions()})
-        await memory.flush()
-        async with memory.session() as session:
-            node = TaskTreeNode
-            motions = (await session.scalars(select(node).where(node.kind == "motion").order_by(node.id))).all()
-            rows = (await session.scalars(select(StateSample).order_by(StateSample.id))).all()
-    assert len(motions) == len(stood) == 8
-    for motion, expected in zip(motions, stood, strict=True):
-        assert motion.end_ns is not None
-        state = {row.channel: row.value for row in rows if row.ns <= motion.end_ns}
-        assert {channel: state[channel] for channel in expected} == expected
 
 
 @pytest.mark.slow

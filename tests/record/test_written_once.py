@@ -35,7 +35,7 @@ from pycrorm_async.projections.columns import COLUMNS
 from pycrorm_async.projections.fold import fold_happening, happening_of
 from pycrorm_async.projections.row_batch import Designators, Row, Rows
 from pycrorm_async.record.episode_writer import fitted
-from pycrorm_async.record.values import NO_REFERENCES, FailureCopies, FrozenPoses, failure_value
+from pycrorm_async.record.values import FailureCopies, FrozenPoses, failure_value
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.projections.event_script import Script
 from tests.record.fakes import NoteActionPerformable, RecorderCase, recorder_case
@@ -191,6 +191,9 @@ def test_a_brief_pose_omits_what_is_exactly_the_default(pose: PoseValue, payload
     assert repr(read.robot.pose) == repr(pose)
 
 
+# --- failures -----------------------------------------------------------------------------------------------------
+
+
 def test_only_poses_of_the_class_whose_objects_never_change_are_copied_once() -> None:
     class Placed(Pose):
         """A class of a user, whose objects may change."""
@@ -205,25 +208,13 @@ def test_only_poses_of_the_class_whose_objects_never_change_are_copied_once() ->
     assert poses.get(pose) is None
 
 
-# --- failures -----------------------------------------------------------------------------------------------------
-
-
 class Spilled(Exception):
     """A failure of a class in Python, to which there are weak references."""
 
+    text = ""
 
-def test_an_exception_is_copied_once_until_it_changes_and_is_not_kept_alive() -> None:
-    copies, failure = FailureCopies(), Spilled("milk", 3)
-    first = copies.copy(failure, NO_REFERENCES)
-    assert first == failure_value(failure, NO_REFERENCES)
-    assert copies.copy(failure, NO_REFERENCES) is first
-    other = Spilled("milk", 3)
-    assert copies.copy(other, NO_REFERENCES) is not first
-    failure.args = ("water",)
-    assert copies.copy(failure, NO_REFERENCES).arguments == ["water"]
-    here = weakref.ref(failure)
-    del failure
-    assert here() is None
+    def __str__(self) -> str:
+        return self.text
 
 
 class Poses:
@@ -235,39 +226,23 @@ class Poses:
         """Return no row."""
 
 
-def test_an_exception_with_a_frozen_pose_and_a_member_of_an_enum_is_copied_once() -> None:
-    copies, failure = FailureCopies(), Spilled(Pose([1.0, 0.0, 0.0]), Arms.LEFT)
-    first = copies.copy(failure, Poses())
-    assert first.arguments[1] == "LEFT"
-    assert copies.copy(failure, Poses()) is first
-
-
-def test_an_exception_of_a_built_in_class_is_copied_at_each_node() -> None:
-    copies, failure = FailureCopies(), ValueError("too far")
-    assert copies.copy(failure, NO_REFERENCES) == copies.copy(failure, NO_REFERENCES)
-    assert copies.copy(failure, NO_REFERENCES).message == "too far"
-
-
-class Changing(Exception):
-    text = "first"
-
-    def __str__(self) -> str:
-        return self.text
-
-
-def test_an_exception_whose_message_changes_on_its_way_up_is_copied_again() -> None:
-    copies, failure = FailureCopies(), Changing()
-    assert copies.copy(failure, NO_REFERENCES).message == "first"
-    failure.text = "second"
-    assert copies.copy(failure, NO_REFERENCES).message == "second"
-
-
-def test_an_exception_whose_argument_changes_in_place_is_copied_again() -> None:
+def test_an_exception_is_copied_once_until_it_changes_and_is_not_kept_alive() -> None:
     copies, tried = FailureCopies(), ["left"]
-    failure = PlanFailure("no arm reaches it", tried)
-    assert copies.copy(failure, NO_REFERENCES).arguments == ["no arm reaches it", ["left"]]
+    failure = Spilled("milk", Arms.LEFT, Pose([1.0, 0.0, 0.0]))
+    first = copies.copy(failure, Poses())
+    assert first == failure_value(failure, Poses())
+    assert copies.copy(failure, Poses()) is first
+    assert copies.copy(Spilled(*failure.args), Poses()) is not first
+    failure.text = "over the table"
+    assert copies.copy(failure, Poses()).message == "over the table"
+    failure.args = ("water", tried)
+    assert copies.copy(failure, Poses()).arguments == ["water", ["left"]]
     tried.append("right")
-    assert copies.copy(failure, NO_REFERENCES).arguments == ["no arm reaches it", ["left", "right"]]
+    assert copies.copy(failure, Poses()).arguments == ["water", ["left", "right"]]
+    here = weakref.ref(failure)
+    del failure
+    assert here() is None
+    assert copies.copy(ValueError("too far"), Poses()).message == "too far"  # there are no weak references to it
 
 
 @dataclass

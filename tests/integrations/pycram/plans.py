@@ -212,8 +212,8 @@ def language() -> Facts:
     return {}
 
 
-def expected_types() -> Facts:
-    """Give the types of fields of some designators, as they are expected ahead and as their values have them."""
+def types_of_fields() -> Facts:
+    """Give the types of the fields of some designators."""
     plans = (
         out_of_reach(),
         MoveJointsMotion(["torso_lift_joint"], [0.1]),
@@ -230,14 +230,7 @@ def expected_types() -> Facts:
         MoveTorsoAction(TorsoState.HIGH),
     ]
     values = PyCRAMValues()
-    kinds = [type(each) for each in designators]
-    return {
-        "expected": [[each.__name__, dict(values.expected_fields(each))] for each in kinds],
-        "actual": [
-            [kind.__name__, values.field_types(kind, values.parameters(each))]
-            for kind, each in zip(kinds, designators, strict=True)
-        ],
-    }
+    return {type(each).__name__: values.field_types(type(each), values.parameters(each)) for each in designators}
 
 
 def monitors() -> Facts:
@@ -312,7 +305,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     simulation,
     nested,
     language,
-    expected_types,
+    types_of_fields,
     monitors,
     threads,
     top_grasp,
