@@ -87,7 +87,7 @@ class Replicas:
         """Copy `seed`, which is not changed."""
         self._folder = folder
         self._process = seed._server  # the programs, and the user who runs them
-        self._synchronous = synchronous
+        self.synchronous = synchronous
         self._count = 0
         self._address = folder / "now"
         self._standby: Path | None = None
@@ -112,9 +112,9 @@ class Replicas:
             settings.write(f"primary_conninfo = '{follows}'\n")
         (standby / "standby.signal").touch()
         self._start(standby)
-        if self._synchronous:
+        if self.synchronous:
             self._set(self._primary, "synchronous_standby_names", STANDBY)
-        states = "'sync'" if self._synchronous else "'async', 'sync'"
+        states = "'sync'" if self.synchronous else "'async', 'sync'"
         self._until(self._primary, f"SELECT count(*) > 0 FROM pg_stat_replication WHERE sync_state IN ({states})")
 
     def lag(self) -> None:
@@ -264,7 +264,9 @@ class PatroniCluster:
     def __exit__(self, *_: object) -> None:
         for number in range(2):
             self._kill(number)
-        self._processes.pop("etcd").kill()
+        etcd = self._processes.pop("etcd")
+        etcd.kill()
+        etcd.wait()
 
     def fail_over(self) -> None:
         """Kill all processes of the node that leads, as a power cut does, and wait until the other one leads."""

@@ -1,7 +1,8 @@
-"""Run a plan that records through a daemon, in a process that the tests kill, and report each step on the output.
+"""Run a plan in a process that the tests kill, and compare the rows of its steps with what it printed before.
 
-Every line is written at once, so that the pipe keeps it when the process dies: `did EPISODE STEP` when `perform` of a
-step has returned, and `ended EPISODE` when the episode has ended. The plan runs until its input is closed.
+Every line is written at once, so that the pipe keeps it when the process dies: `did PLACE STEP` when `perform` of a
+step has returned, `synced` after a sync of all of them, `ended PLACE` when the episode has ended, and `faults COUNT`
+before the memory is closed.
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ import itertools
 import os
 import random
 import select
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.settings import Writer
+from tests.databases import ask
 
 SETTINGS = Settings(
     sync_interval_ms=5,
@@ -25,6 +30,8 @@ SETTINGS = Settings(
     spool_reserve_bytes=2**18,
     flush_timeout_s=60,
 )
+_PATIENT = replace(SETTINGS, connect_timeout_s=3600, flush_timeout_s=3600)
+"""Timeouts that no busy machine reaches: opening a database may take a minute there."""
 
 
 @dataclass
@@ -44,24 +51,102 @@ def stop_requested() -> bool:
     return bool(select.select([0], [], [], 0)[0])
 
 
-async def perform_steps(url: str, spool: Path, name: str, rng: random.Random, pause_s_max: float) -> None:
-    async with Memory.open(url, spool=spool, writer="daemon", settings=SETTINGS) as memory:
-        report("opened")
-        for number in itertools.count():
-            episode = f"{name}.{number}"
-            async with memory.episode(description=episode):
-                for step in range(rng.randrange(1, 60)):
-                    await StepActionPerformable(episode, step).perform()
-                    report("did", episode, step)
-                    if rng.random() < 0.1:
-                        await asyncio.sleep(rng.random() * pause_s_max)
-            report("ended", episode)
-            if stop_requested():
-                return
-            if rng.random() < 0.05:
-                await memory.synced()
+def walk(url: str, spool: str, writer: Writer, name: str, seed: int, lanes: int = 1) -> None:
+    """Perform steps until the input is closed; each lane is a plan with episodes of its own, beside the others."""
+    asyncio.run(_walk(url, Path(spool), writer, name, seed, lanes))
 
 
-def run_step_robot(url: str, spool: str, name: str, seed: int, pause_s_max: float) -> None:
-    """Perform steps until the input is closed, with a pause of at most `pause_s_max` after every tenth on average."""
-    asyncio.run(perform_steps(url, Path(spool), name, random.Random(seed), pause_s_max))
+async def _walk(url: str, spool: Path, writer: Writer, name: str, seed: int, lanes: int) -> None:
+    async with Memory.open(url, spool=spool, writer=writer, settings=_PATIENT) as memory:
+        plans = [_walk_lane(memory, f"{name}.{lane}", random.Random(f"{seed} {lane}")) for lane in range(lanes)]
+        await asyncio.gather(*plans)
+        report("faults", memory.status.faults.total)
+
+
+async def _walk_lane(memory: Memory, name: str, rng: random.Random) -> None:
+    for number in itertools.count():
+        place = f"{name}.{number}"
+        async with memory.episode(description=place):
+            for step in range(1, rng.randrange(2, 60)):
+                await StepActionPerformable(place, step).perform()
+                report("did", place, step)
+                chance = rng.random()
+                if chance < 0.5:
+                    await asyncio.sleep(rng.random() * 0.005)
+                elif chance < 0.55:
+                    await memory.synced()
+                    report("synced")
+        report("ended", place)
+        if stop_requested():
+            return
+
+
+# === comparison ===============================================================================================
+
+Event = tuple[str, int, str]
+"""An episode, a sequence in it, and the content of the event."""
+
+
+def verify_kept(acknowledged: Iterable[Event], existing: Iterable[Event], *, possible: Iterable[Event] = ()) -> None:
+    """Verify that each acknowledged event exists once and in order, and no other one but those that are `possible`.
+
+    Possible are events that a process tried to record without an acknowledgement before it died.
+    """
+    expected, events = set(acknowledged), list(existing)
+    found = set(events)
+    assert expected - found == set(), "lost"
+    assert found - expected - set(possible) == set(), "changed, or never recorded"
+    last: defaultdict[str, int] = defaultdict(int)
+    for episode, sequence, _ in events:
+        assert sequence == last[episode] + 1, f"doubled or out of order: {episode} {sequence}"
+        last[episode] = sequence
+
+
+class RecordedSteps:
+    """The steps that plans printed: `certain` ones must be in the tables, `possible` ones may be.
+
+    `ended` holds the places whose episodes ended before the plan was killed.
+    """
+
+    def __init__(self) -> None:
+        self.certain: list[Event] = []
+        self.possible: list[Event] = []
+        self.ended: set[str] = set()
+
+    def add(self, lines: list[list[str]], *, when_synced: bool = False) -> None:
+        """Add the lines of one plan. With `when_synced` only the steps before the last `synced` are certain."""
+        sync = max([-1, *(index for index, line in enumerate(lines) if line[0] == "synced")])
+        end = sync if when_synced else len(lines)
+        last: dict[str, tuple[str, int]] = {}
+        for index, line in enumerate(lines):
+            if line[0] == "ended" and index < end:
+                self.ended.add(line[1])
+            if line[0] == "did":
+                place, step = line[1], int(line[2])
+                last[place.rpartition(".")[0]] = place, step
+                if index < end:
+                    self.certain.append((place, step, "SUCCEEDED"))
+                else:
+                    self.possible += [(place, step, status) for status in ("SUCCEEDED", "LOST")]
+        for lane, (place, step) in last.items():  # died in the next step of the episode or the first of the next one
+            following = [(place, step + 1), (f"{lane}.{int(place.rpartition('.')[2]) + 1}", 1)]
+            self.possible += [(*each, status) for each in following for status in ("SUCCEEDED", "LOST")]
+
+    def verify(self, url: str) -> None:
+        """Compare with the rows of a database into which no process writes any more."""
+        rows = ask(
+            url,
+            "SELECT place, step, status FROM step_action JOIN task_tree_node ON step_action.id = task_tree_node.id"
+            " ORDER BY step_action.id",
+        )
+        verify_kept(self.certain, rows, possible=self.possible)
+        incomplete = ask(
+            url,
+            "SELECT * FROM episode WHERE refused IS NOT NULL OR parked IS NOT NULL OR head <> folded OR head <>"
+            " (SELECT count(*) FROM event WHERE event.episode = episode.number)",
+        )
+        assert incomplete == []
+        episodes = ask(url, "SELECT description, status FROM process_metadata")
+        statuses = dict(episodes)
+        assert len(statuses) == len(episodes)
+        assert {place: statuses[place] for place in self.ended} == dict.fromkeys(self.ended, "SUCCEEDED")

@@ -7,22 +7,28 @@ import itertools
 import os
 import random
 import select
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from bench.breaking import processes
 from pycrorm_async import Memory, Reading, Settings, recover
-from pycrorm_async.clock import Clock
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import SpoolFull
+from pycrorm_async.events.codec import LOST, Heading
+from pycrorm_async.events.ids import episode_id, episode_text
+from pycrorm_async.queue import RecorderQueue, Spool
 from tests.commands import COMMAND, answer, environment, pycrorm
-from tests.crash.forked_processes import ForkedProcess
+from tests.crash.forked_processes import ForkedProcess, die_after
+from tests.crash.step_robot import RecordedSteps, report, verify_kept, walk
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts
+from tests.queue.factories import recover as recover_records
 
 pytestmark = pytest.mark.slow
 
@@ -30,16 +36,102 @@ pytestmark = pytest.mark.slow
 # === queue kill ===============================================================================================
 #
 # Kill recorders with SIGKILL at any moment: every record whose `put_nowait` returned is stored once and in order.
+#
+# A recorder prints `put EPISODE SEQUENCE` when `put_nowait` has returned, and before it acknowledges a batch
+# `stored POSITION EPISODE SEQUENCE PAYLOAD` for each record of it.
+
+RECORDING = Settings(
+    sync_interval_ms=2, segment_bytes=2**14, spool_bytes_max=2**26, spool_reserve_bytes=1, record_bytes_max=2**12
+)
+
+
+def record_until_killed(spool: str, seed: int, threads: int, is_drained: bool, cpu_s: float) -> None:
+    die_after(cpu_s)
+    rng = random.Random(seed)
+    name = episode_id(time.time_ns(), rng.randbytes(10))
+    queue = RecorderQueue.create(Path(spool), settings=RECORDING, clock=SYSTEM_CLOCK, recorder=name)
+    for number in range(threads):
+        threading.Thread(target=_put, args=(queue, random.Random(f"{seed} {number}")), daemon=True).start()
+    if is_drained:
+        asyncio.run(_store(queue, rng))
+    threading.Event().wait()
+
+
+def _put(queue: RecorderQueue, rng: random.Random) -> None:
+    while True:
+        episode = episode_id(time.time_ns(), rng.randbytes(10))
+        name = episode_text(episode)
+        kinds = ["EpisodeStarted", *["NodeStarted"] * rng.randrange(1, 40), "EpisodeEnded"]
+        for index, kind in enumerate(kinds, start=1):
+            payload = f"{name}/{index}/".encode() + b"x" * rng.randrange(0, 1200)
+            report("put", name, queue.put_nowait(Heading(episode, kind, 1), payload))
+
+
+async def _store(queue: RecorderQueue, rng: random.Random) -> None:
+    while batch := await queue.get_batch(events_max=rng.randrange(1, 50), bytes_max=2**16, age_s_max=0.001):
+        for each in batch:
+            assert each.episode is not None
+            name = episode_text(each.episode)
+            report("stored", each.position, name, each.sequence, each.payload.rstrip(b"x").decode())
+        await queue.acknowledge(batch[-1].position)
+
+
+def verify_recovered(spool: Path, lines: list[list[str]], threads: int) -> int:
+    """Compare what a killed recorder printed with what is left of it; return the number of acknowledged events."""
+    acknowledged = [(line[1], int(line[2]), f"{line[1]}/{line[2]}/") for line in lines if line[0] == "put"]
+    by_position = {int(line[1]): (line[2], int(line[3]), line[4]) for line in lines if line[0] == "stored"}
+    ends: list[tuple[str, int]] = []
+    for recorder in Spool(spool).recorders():
+        records = asyncio.run(recover_records(recorder.path))
+        if records:
+            assert asyncio.run(recover_records(recorder.path)) == records
+        for each in records:
+            assert each.episode is not None
+            name = episode_text(each.episode)
+            if each.payload == LOST:
+                ends.append((name, each.sequence))
+                continue
+            event = name, each.sequence, each.payload.rstrip(b"x").decode()
+            assert by_position.setdefault(each.position, event) == event
+    assert sorted(by_position) == list(range(1, len(by_position) + 1))
+    events = [by_position[position] for position in sorted(by_position)]
+    assert all(text == f"{name}/{sequence}/" for name, sequence, text in events)
+    verify_kept(acknowledged, events, possible=events)
+    assert len(events) <= len(acknowledged) + threads  # each thread may die before it prints its last event
+    last = {name: sequence for name, sequence, _ in events}
+    assert len(ends) <= threads
+    assert all(sequence == last.get(name, 0) + 1 for name, sequence in ends)
+    return len(acknowledged)
 
 
 @pytest.mark.parametrize("kills", [24, pytest.param(10_000, marks=pytest.mark.soak)])
-def test_every_written_record_survives_a_kill_once_and_in_order(tmp_path: Path, kills: int, in_turn: bool) -> None:
-    seed = random.SystemRandom().randrange(2**20)
-    print(f"seed {seed}")
+def test_every_written_record_survives_a_kill_once_and_in_order(
+    tmp_path: Path, kills: int, in_turn: bool, rng: random.Random
+) -> None:
     rounds = min(kills, 1_000) if in_turn else kills
-    outcome = processes.killed_recorders(rounds, random.Random(seed), tmp_path, lambda: None)
-    assert (outcome.clean, outcome.rounds) == (True, rounds), outcome
-    assert outcome.events > 10 * rounds
+    events = 0
+    for first in range(0, rounds, 4):
+        lives: list[tuple[Path, int, ForkedProcess]] = []
+        for number in range(first, min(first + 4, rounds)):
+            spool, threads = tmp_path / str(number), rng.choice((1, 1, 2, 3))
+            options = rng.randrange(2**31), threads, rng.random() < 0.5, rng.random() * 0.05
+            lives.append((spool, threads, ForkedProcess(record_until_killed, str(spool), *options)))
+        for spool, threads, recorder in lives:
+            events += verify_recovered(spool, recorder.wait_until_killed(), threads)
+            shutil.rmtree(spool, ignore_errors=True)  # it may have died before it made its spool
+    assert events > 10 * rounds
+
+
+@pytest.mark.soak  # test_daemon kills plans and the daemon that drains them
+def test_killed_plans_leave_every_step_stored_once(tmp_path: Path, in_turn: bool, rng: random.Random) -> None:
+    url, spool, steps = f"sqlite:///{tmp_path}/memory.db", tmp_path / "spool", RecordedSteps()
+    for number in range(25 if in_turn else 500):
+        plan = ForkedProcess(walk, url, str(spool), "thread", f"plan{number}", rng.randrange(2**31))
+        plan.wait_for("did")
+        time.sleep(rng.random() * 0.2)
+        steps.add(plan.kill_and_read())
+    asyncio.run(recover(url, spool=spool))
+    steps.verify(url)
 
 
 # === exit and clock ===========================================================================================
