@@ -19,7 +19,6 @@ the node's episode, and it takes no lock.
 from __future__ import annotations
 
 import inspect
-import math
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -658,22 +657,13 @@ class WorldRecorder(ObjectRows[Object]):
                 dict(added.joint_positions()),
                 self._causing_node(),
                 self._emitter.descriptions.declare(added),
-                self._color(added),
+                _color(added),
                 *_model(added),
                 added.mass_kg,
                 clean(added.base_link) or None,
             ),
             row_of=added,
         )
-
-    def _color(self, added: Object) -> tuple[float, float, float, float] | None:
-        if added.color is None:
-            return None
-        red, green, blue, opacity = map(float, added.color)
-        if not all(map(math.isfinite, (red, green, blue, opacity))):
-            self._emitter.missing.note("ObjectAdded", "color", f"{added.color} is not finite")
-            return None
-        return red, green, blue, opacity
 
     def object_removed(self, removed: Object) -> None:
         self._acting.pop(removed, None)
@@ -714,6 +704,13 @@ class WorldRecorder(ObjectRows[Object]):
             sequence: int = node.record.sequence
             return sequence
         return None
+
+
+def _color(added: Object) -> tuple[float, float, float, float] | None:
+    if added.color is None:
+        return None
+    red, green, blue, opacity = map(float, added.color)
+    return red, green, blue, opacity
 
 
 def _model(added: Object) -> tuple[str | None, str | None]:

@@ -25,10 +25,3 @@ def daemon(database_url: str, spool: Path) -> Start:
         await started.task
 
     return running
-
-
-@pytest.fixture
-def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The default spool of a database on a server is in the current folder."""
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")

@@ -328,10 +328,11 @@ async def test_a_daemon_that_is_cancelled_during_a_scan_leaves_the_folders_to_th
             lambda: Memory.open("sqlite:///x.db", writer="daemon", views=[UserView("v", select(ProcessMetaData.id))]),
             "without the views of this process",
         ),
+        (lambda: Memory.open("sqlite://", writer="process"), "so no other process can write it: use writer='thread'"),
         (lambda: Memory.open("sqlite:///x.db", settings=Settings(writer="cron")), "use 'thread' or 'process' or"),  # type: ignore[arg-type]
     ],
 )
-def test_an_impossible_daemon_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
+def test_an_impossible_writer_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
     with pytest.raises(CallerError, match=words):
         open_it()
 

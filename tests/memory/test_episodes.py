@@ -6,7 +6,6 @@ import asyncio
 import logging
 import math
 import os
-import signal
 import threading
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -120,31 +119,6 @@ async def test_several_processes_tag_an_episode_at_once_and_every_tag_is_there(
     await asyncio.gather(*(tag_episode(address, "1", (f"tag {number}",), ()) for number in range(6)))
     async with Reading.open(database_url) as reading:
         assert await tags_of(reading) == {"one": [f"tag {number}" for number in range(6)]}
-    await assert_intact(database_url)
-
-
-@pytest.mark.slow
-async def test_a_tagger_that_loses_a_race_decides_again_from_the_new_tags(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened = Memory.open(database_url, spool=tmp_path / "spool")
-    async with opened as memory, memory.episode(description="one", tags=["kitchen"]):
-        pass
-    address, append = DatabaseAddress.parse(database_url), operation._append
-    raced = False
-
-    async def race(*arguments: Any) -> bool:
-        nonlocal raced
-        if not raced:
-            raced = True
-            await tag_episode(address, "1", ("first",), ("kitchen",))
-        return await append(*arguments)
-
-    monkeypatch.setattr(operation, "_append", race)
-    with pytest.raises(CallerError, match="the episode has no tag 'kitchen'; its tags: first"):
-        await tag_episode(address, "1", ("second",), ("kitchen",))
-    async with Reading.open(database_url) as reading:
-        assert await tags_of(reading) == {"one": ["first"]}
     await assert_intact(database_url)
 
 
@@ -520,30 +494,6 @@ async def test_the_world_of_an_episode_that_runs_or_is_lost_is_that_of_its_objec
                 entered.object("pr2").remove()
             assert await world() == "pr2 (ROBOT), bowl (BOWL), milk (MILK)"
         assert await world() == f"BulletWorld (DIRECT, {ENGINE}): milk (MILK)"
-
-
-@pytest.mark.slow
-def test_a_lost_episode_names_the_objects_of_its_world(tmp_path: Path) -> None:
-    program = """
-import asyncio, os, signal
-from pycrorm_async import Memory
-from pycrorm_async.world import BulletWorld, Object, ObjectType
-async def main():
-    async with Memory.open("sqlite:///memory.db") as memory:
-        async with memory.episode(description="killed"):
-            with BulletWorld():
-                Object("pr2", ObjectType.ROBOT)
-                Object("bowl", ObjectType.BOWL).remove()
-                Object("milk", ObjectType.MILK)
-                os.kill(os.getpid(), signal.SIGKILL)
-asyncio.run(main())
-"""
-    assert run_script(program, cwd=tmp_path).returncode == -signal.SIGKILL
-    url = f"sqlite:///{tmp_path}/memory.db"
-    assert pycrorm("writer", "--once", "--url", url, cwd=tmp_path).returncode == 0
-    [episode] = answer("episodes", "--url", url, cwd=tmp_path)
-    assert (episode["status"], episode["world"]) == ("LOST", "pr2 (ROBOT), milk (MILK)")
-    assert "pr2 (ROBOT), milk (MILK)" in pycrorm("show", "1", "--url", url, cwd=tmp_path).stdout
 
 
 @pytest.mark.slow

@@ -171,8 +171,9 @@ async def drained_by(writer: Writer, url: str, spool: Path) -> AsyncIterator[Non
 
 
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("deleted", ["folder", "spool"])
-@pytest.mark.parametrize("writer", ["thread", "daemon", "process"])
+@pytest.mark.parametrize(
+    ("writer", "deleted"), [("thread", "folder"), ("thread", "spool"), ("daemon", "spool"), ("process", "folder")]
+)
 async def test_the_plan_continues_and_the_next_memory_records_again(
     database_url: str, tmp_path: Path, writer: Writer, deleted: str, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import gc
 import sqlite3
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from sqlalchemy import select
@@ -30,12 +29,10 @@ from pycrorm_async.errors import (
 from pycrorm_async.events.codec import Heading, encode, fingerprint
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.rebuild import rebuild_memory
-from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
-from pycrorm_async.plan import ActionAbstract, PlanFailure
+from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.plan import PlanFailure
 from pycrorm_async.plan.execution import recorder
-from pycrorm_async.task_status import TaskStatus
 from tests.commands import answer
-from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 # === memory ===================================================================================================
@@ -89,44 +86,9 @@ async def test_an_exception_leaves_the_plan_unchanged_and_is_recorded(tmp_path: 
             assert metadata.failure_message == "spilled"
 
 
-@pytest.mark.slow
-async def test_a_cancelled_node_has_the_status_cancelled(tmp_path: Path) -> None:
-    @dataclass
-    class WaitActionPerformable(ActionAbstract):
-        async def perform(self) -> None:
-            begun.set()
-            await asyncio.sleep(60)
-
-    begun = asyncio.Event()
-    async with Memory.open(url_of(tmp_path)) as memory:
-        async with memory.episode(description="e"):
-            task = asyncio.create_task(WaitActionPerformable().perform())
-            await begun.wait()
-            task.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await task
-        await memory.flush()
-        async with memory.session() as session:
-            node = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.dtype == "WaitAction"))).one()
-            assert node.status == TaskStatus.CANCELLED
-            assert node.reason == "CancelledError"
-
-
 # === refusals =================================================================================================
 #
 # Refusals by a memory and their messages; no recorded event is lost by one.
-
-
-@pytest.mark.slow
-async def test_a_memory_that_is_not_open_names_the_call_that_opens_it(tmp_path: Path) -> None:
-    memory = Memory.open(url_of(tmp_path))
-    with pytest.raises(CallerError, match=r"async with Memory\.open"):
-        await memory.flush()
-    async with memory:
-        pass
-    with pytest.raises(CallerError, match=r"async with Memory\.open"):
-        async with memory.episode(description="e"):
-            pass
 
 
 @pytest.mark.slow
@@ -193,26 +155,6 @@ async def flushed(memory: Memory) -> None:
 
 
 @pytest.mark.slow
-async def test_a_field_that_contradicts_the_tables_has_a_column_of_its_own(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)):
-        await NoteActionPerformable("text").perform()
-
-    @dataclass
-    class Other(ActionAbstract):
-        dtype: ClassVar[str] = "NoteAction"
-        text: int
-
-        async def perform(self) -> None:
-            """Succeed without doing anything."""
-
-    async with Memory.open(url_of(tmp_path)) as memory:
-        await Other(7).perform()
-        await memory.flush()
-        assert await texts(memory) == ["text", None]
-    assert ask(url_of(tmp_path), "SELECT text_integer FROM note_action ORDER BY id") == [(None,), (7,)]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -260,7 +202,12 @@ def test_a_removed_setting_is_accepted_with_a_warning(caplog: pytest.LogCaptureF
 
 
 @pytest.mark.slow
-async def test_an_attribute_of_a_memory_that_is_not_open_raises_attribute_error(tmp_path: Path) -> None:
+async def test_a_memory_that_is_not_open_names_the_call_that_opens_it(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    async with memory:
+        pass
+    with pytest.raises(CallerError, match=r"async with Memory\.open"):
+        await memory.flush()
     memory = Memory.open(url_of(tmp_path))
     for use in (
         lambda: memory.status,
@@ -377,41 +324,18 @@ async def test_a_perform_that_is_not_awaited_is_a_fault_of_its_episode(tmp_path:
             await NoteActionPerformable("fine").perform()
         assert other.faults == ()
         assert memory.status.faults == (2, SENTENCE)
+        with quiet():
+            NoteActionPerformable("outside").perform()  # type: ignore[unused-coroutine]  # the fault here
+        assert memory.status.faults == (3, SENTENCE)
+        async with memory.episode() as third:
+            forgotten = NoteActionPerformable("forgotten").perform()
+        assert third.faults == (FAULT,)  # it still exists, and is noticed once
+        with quiet():
+            del forgotten
+        assert memory.status.faults == (4, SENTENCE)
         assert memory.status.unawaited == (SENTENCE,)
         await memory.flush()
         assert await texts(memory) == ["kept", "fine"]
-
-
-@pytest.mark.slow
-async def test_one_that_still_exists_at_the_end_of_its_episode_is_noticed_then_and_once(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        async with memory.episode() as episode:
-            forgotten = NoteActionPerformable("forgotten").perform()
-        assert episode.faults == (FAULT,)
-        with quiet():
-            del forgotten
-        assert memory.status.faults.total == 1
-
-
-@pytest.mark.slow
-async def test_outside_any_episode_it_is_a_fault_of_the_memory(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with quiet():
-            NoteActionPerformable("lost").perform()  # type: ignore[unused-coroutine]  # the fault here
-        assert memory.status.unawaited == (SENTENCE,)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.version_info >= (3, 12), reason="Python keeps the frame of a coroutine closed before its start")
-async def test_a_perform_that_was_closed_before_its_start_is_no_fault(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        async with memory.episode() as episode:
-            closed = NoteActionPerformable("closed").perform()
-            closed.close()
-            del closed
-            gc.collect()
-        assert episode.faults == ()
-        assert memory.status.faults.total == 0
 
 
 @pytest.mark.slow

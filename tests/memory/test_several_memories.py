@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.plan.execution import recorder
 from pycrorm_async.store.log import EventLog
@@ -61,42 +60,6 @@ async def test_the_next_memory_adopts_the_folder_of_a_killed_process(tmp_path: P
     assert [path for path in (tmp_path / "memory.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
 
-async def test_concurrent_episodes_in_tasks_of_their_own_are_all_whole(tmp_path: Path) -> None:
-    async def run(name: str) -> None:
-        async with memory.episode(description=name):
-            for index in range(20):
-                await NoteActionPerformable(f"{name}{index}").perform()
-                await asyncio.sleep(0)
-
-    async with Memory.open(url_of(tmp_path)) as memory:
-        await asyncio.gather(*(run(name) for name in "abcde"))
-        await memory.flush()
-        result = await memory.reading.episodes()
-        assert sorted(each.description for each in result) == list("abcde")
-        for each in result:
-            nodes = await memory.reading.tree(each.number)
-            assert [node.parameters.get("text") for node in nodes] == [None] + [
-                f"{each.description}{index}" for index in range(20)
-            ]
-        with pytest.raises(UnknownEpisode):
-            await memory.reading.episode("nothing")
-
-
-async def test_a_memory_opened_inside_an_episode_of_another_leaves_that_episode_whole(tmp_path: Path) -> None:
-    outer, inner = f"sqlite:///{tmp_path}/1.db", f"sqlite:///{tmp_path}/2.db"
-    async with Memory.open(outer) as one:
-        async with one.episode(description="outer"):
-            await NoteActionPerformable("1").perform()
-            async with Memory.open(inner) as two:
-                await NoteActionPerformable("2").perform()
-                await two.flush()
-                assert await texts(two) == ["2"]
-            await NoteActionPerformable("3").perform()
-        await one.flush()
-        assert [each.description for each in await one.reading.episodes()] == ["outer"]
-        assert await texts(one) == ["1", "3"]
-
-
 async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, sys, warnings\n"
@@ -122,25 +85,6 @@ async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path:
     async with Reading.open(url_of(tmp_path)) as reading:
         assert await texts(reading) == ["before", "after"]
         assert [each.status for each in await reading.episodes()] == ["SUCCEEDED"]
-
-
-async def test_a_plan_that_outlives_the_memory_continues_and_is_not_recorded(tmp_path: Path) -> None:
-    leave = asyncio.Event()
-
-    async def late() -> str:
-        await NoteActionPerformable("early").perform()
-        await leave.wait()
-        await NoteActionPerformable("late").perform()
-        return "ran"
-
-    async with Memory.open(url_of(tmp_path)) as memory:
-        task = asyncio.create_task(late())
-        await asyncio.sleep(0.1)
-        assert memory.status.faults.total == 0
-    leave.set()
-    assert await task == "ran"
-    async with Reading.open(url_of(tmp_path)) as reading:
-        assert await texts(reading) == ["early"]
 
 
 async def test_memories_closed_in_another_order_than_opened_record_their_own_plans(tmp_path: Path) -> None:

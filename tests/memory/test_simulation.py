@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from pycrorm_async.orm import (
     Attachment,
     MoveAndPickUpAction,
     Object,
-    PickUpAction,
     PickUpWithContextView,
     ProcessMetaData,
     TaskTreeNode,
@@ -36,7 +34,8 @@ from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.commands import answer, pycrorm, run_script
+from tests.commands import pycrorm, run_script
+from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 pytestmark = pytest.mark.slow
@@ -74,7 +73,7 @@ async def fetched(url: str) -> None:
             await FetchFromAnywhereActionPerformable(designator_of(cereal)).perform()
 
 
-async def test_the_plan_found_by_simulation_is_recorded_and_the_simulations_are_left_out(tmp_path: Path) -> None:
+async def test_simulations_are_left_out_unless_they_are_asked_for(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     async with Reading.open(url_of(tmp_path)) as reading:
         async with reading.session() as session:
@@ -84,20 +83,9 @@ async def test_the_plan_found_by_simulation_is_recorded_and_the_simulations_are_
             ]  # fmt: skip
             done = (await session.scalars(select(MoveAndPickUpAction))).one()
             assert (done.standing_position.x, done.object.name) == (0.6, "cereal")
-            assert [each.description for each in await session.scalars(select(ProcessMetaData))] == ["fetch the cereal"]
             positions = {(each.pose.x, each.pose.y) for each in await session.scalars(select(Object)) if each.pose}
             assert (-2.0, 0.0) not in positions
-            assert len((await session.scalars(select(Attachment))).all()) == 1
             assert set(await session.scalars(select(TaskTreeNode.simulated))) == {False}
-        frame = await reading.dataframe(select(PickUpWithContextView))
-        assert list(frame.status) == ["SUCCEEDED"]
-
-
-async def test_a_reader_that_asks_for_simulations_sees_their_results(tmp_path: Path) -> None:
-    await fetched(url_of(tmp_path))
-    async with Reading.open(url_of(tmp_path)) as reading:
-        frame = await reading.dataframe(select(PickUpWithContextView), simulated=True)
-        assert sorted(frame.status) == ["FAILED", "SUCCEEDED", "SUCCEEDED"]
         async with reading.session(simulated=True) as session:
             episodes = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
             assert [(each.description, each.simulated, each.status) for each in episodes] == [
@@ -110,13 +98,16 @@ async def test_a_reader_that_asks_for_simulations_sees_their_results(tmp_path: P
             assert {(each.thought_by, each.thought_by_node) for each in episodes[1:]} == {
                 (episodes[0].uuid, thinker.id >> 5 & 2**26 - 1)
             }
-            picked = (await session.scalars(select(PickUpAction).order_by(PickUpAction.id))).all()
-            # each episode has a cereal of its own, where it was when it was picked up
-            assert len({each.object.id for each in picked}) == 3
-            poses = [each.object.pose for each in picked]
-            assert {(each.x, each.y, each.z) for each in poses if each is not None} == {(1.3, 0.7, 0.95)}
             held = (await session.scalars(select(Attachment).order_by(Attachment.id))).all()
             assert [each.process_metadata_id for each in held] == [1, 3]
+        frames = [await reading.dataframe(select(PickUpWithContextView), simulated=each) for each in (False, True)]
+        assert [sorted(each.status) for each in frames] == [["SUCCEEDED"], ["FAILED", "SUCCEEDED", "SUCCEEDED"]]
+    counts = "SELECT (SELECT count(*) FROM pick_up_action), (SELECT count(*) FROM process_metadata)"
+    assert ask(url_of(tmp_path), counts) == [(1, 1)]
+    url = ("--url", url_of(tmp_path))
+    assert pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout.count("by FetchFromAnywhereAction of") == 2
+    assert "simulated by FetchFromAnywhereAction of episode 1" in pycrorm("show", "3", *url, cwd=tmp_path).stdout
+    assert "simulated in episodes 2, 3" in pycrorm("show", "last", *url, cwd=tmp_path).stdout
 
 
 async def test_simulations_without_an_episode_are_recorded_too(tmp_path: Path) -> None:
@@ -185,39 +176,3 @@ async def test_a_simulation_whose_process_is_killed_is_lost_with_the_episode_aro
             ("simulation", "LOST", True),
         ]
         assert await texts(reading) == ["real"]
-
-
-async def test_plain_sqlite3_shows_only_what_really_happened_and_the_command_simulations_too(tmp_path: Path) -> None:
-    await fetched(url_of(tmp_path))
-    connection = sqlite3.connect(tmp_path / "memory.db")
-    count = "SELECT (SELECT count(*) FROM pick_up_action), (SELECT count(*) FROM process_metadata)"
-    assert connection.execute(count).fetchall() == [(1, 1)]
-    connection.close()
-    url = ("--url", url_of(tmp_path))
-    table = pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout
-    assert table.count("by FetchFromAnywhereAction of episode 1") == 2
-    shown = pycrorm("show", "3", *url, cwd=tmp_path).stdout
-    assert "simulated by FetchFromAnywhereAction of episode 1" in shown
-    real = pycrorm("show", "1", *url, cwd=tmp_path).stdout
-    simulating = next(line for line in real.splitlines() if "FetchFromAnywhereAction" in line)
-    assert simulating.endswith("simulated in episodes 2, 3")
-
-
-@pytest.mark.soak  # the test before it runs three of these commands
-async def test_the_command_leaves_simulations_out_and_shows_them_on_request(tmp_path: Path) -> None:
-    await fetched(url_of(tmp_path))
-    url = ("--url", url_of(tmp_path))
-    assert [each["number"] for each in answer("episodes", *url, cwd=tmp_path)] == [1]
-    listed = answer("episodes", "--simulated", *url, cwd=tmp_path)
-    assert [(each["number"], each["simulated"]) for each in listed] == [(1, False), (2, True), (3, True)]
-    assert [listed[2]["thought_by"][name] for name in ("episode", "dtype")] == [1, "FetchFromAnywhereAction"]
-    assert answer("show", "last", *url, cwd=tmp_path)["episode"]["number"] == 1
-    simulation_document = answer("show", "2", *url, cwd=tmp_path)
-    assert simulation_document["episode"]["simulated"] is True
-    assert {each["simulated"] for each in simulation_document["tree"]} == {True}
-    assert [each["dtype"] for each in simulation_document["tree"]][:3] == [
-        None,
-        "MoveAndPickUpAction",
-        "NavigateAction",
-    ]
-    assert "simulated" not in pycrorm("episodes", *url, cwd=tmp_path).stdout

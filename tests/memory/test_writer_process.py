@@ -10,7 +10,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +18,8 @@ import psutil
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory, Reading, Settings, UserView
-from pycrorm_async.errors import CallerError, FlushTimeout
+from pycrorm_async import Memory, Reading, Settings
+from pycrorm_async.errors import FlushTimeout
 from pycrorm_async.operations import writer_process
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
@@ -334,19 +333,3 @@ async def test_an_error_that_ends_the_process_is_in_its_reason(
     async with opened(put_memory(tmp_path / "memory.db"), tmp_path / "spool") as memory:
         await until(lambda: memory.status.writer_process.reason is not None)  # type: ignore[union-attr]
     assert "ended: ZeroDivisionError: division by zero; starting another in" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("open_it", "words"),
-    [
-        (lambda: Memory.open("sqlite://", writer="process"), "so no other process can write it: use writer='thread'"),
-        (
-            lambda: Memory.open("sqlite:///x.db", writer="process", views=[UserView("v", select(ProcessMetaData.id))]),
-            "the other process creates the tables, without the views of this process",
-        ),
-    ],
-)
-def test_an_impossible_process_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
-    with pytest.raises(CallerError, match=words):
-        open_it()
-    assert not Path("x.db").exists()
