@@ -1,6 +1,6 @@
 """Faults that could make the system lose, double or reorder an event, and the tests that inject them.
 
-The soak runs more and longer rounds (`python -m pytest -m soak tests/crash`), some on disks of their own. Random choices
+The soak runs more and longer rounds (`python -m pytest -m soak tests/crash`), some on real disks. Random choices
 follow from a seed that is printed, and that PYCRORM_TEST_SEED sets.
 
  1  SIGKILL at any moment

@@ -3,7 +3,7 @@
 import errno
 import os
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
@@ -12,17 +12,18 @@ from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.format import CHECKSUM, salt_of, segment_numbers
+from pycrorm_async.queue.format import CHECKSUM, EVENT, Frame, encode, salt_of, segment_numbers
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.maintenance import repair_folder
 from pycrorm_async.queue.scan import scan, seal, tails
-from pycrorm_async.queue.spool import parse_folder_name
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
+    WALL_NS,
     FolderWriter,
     drain,
     ended,
+    episode,
     lost,
     make,
     node,
@@ -110,48 +111,22 @@ def torn_end(whole: bytes, offset: int, size: int, filling: bytes) -> int:
     return offset + len(whole[offset : offset + size].rstrip(filling))
 
 
-async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_tail(author: FolderWriter) -> None:
-    author.put(started())
-    author.sync()
-    author.put(node(), b"never reached the disk")
-    author.put(node(), b"did")
-    path, offset, size = author.places[1]
-    overwrite(path, offset, bytes(size))
-    recovered = open_dead(author.folder)
-    assert recovered is not None
-    assert await drain(recovered) == [author.records[0], lost(2, 1, 2)]
-    recovered.release()
-    [(_, tail)] = tails(author.folder, scan(author.folder, RECORDER))
-    assert tail
-
-
-async def test_a_later_segment_that_reached_the_disk_before_the_end_of_its_predecessor_is_a_legal_tail(
-    author: FolderWriter,
+@pytest.mark.parametrize(
+    ("unsynced", "missing", "kept"),
+    [(["{}", "never reached the disk", "did"], 1, 1), (["x" * 900] * 5, 2, 2), (["x" * 900] * 4, "header", 4)],
+    ids=["a record before another", "the end of a segment before the next", "the header of a segment"],
+)
+async def test_what_no_sync_covers_may_be_missing_before_what_reached_the_disk(
+    author: FolderWriter, unsynced: list[str], missing: int | str, kept: int
 ) -> None:
     author.put(started())
     author.sync()
-    for _ in range(5):
-        author.put(node(), b"x" * 900)
-    assert len(author.segments) == 2
-    path, offset, size = author.places[3]
+    for payload in unsynced:
+        author.put(node(), payload.encode())
+    path, offset, size = (author.segments[-1], 0, 96) if missing == "header" else author.places[int(missing)]
     overwrite(path, offset, bytes(size))
-    assert await recover(author.folder) == [*author.records[:3], lost(4, 1, 4)]
-
-
-async def test_a_segment_whose_header_did_not_reach_the_disk_is_a_legal_tail(author: FolderWriter) -> None:
-    author.put(started())
-    for _ in range(3):
-        author.put(node(), b"x" * 900)
-    author.sync()
-    author.put(node(), b"x" * 900)
-    overwrite(author.segments[1], 0, bytes(96))
-    assert await recover(author.folder) == [*author.records[:4], lost(5, 1, 5)]
-
-
-async def test_nothing_of_a_first_segment_that_was_never_synced_must_be_on_the_disk(author: FolderWriter) -> None:
-    author.put(started())
-    overwrite(author.segments[0], 0, bytes(40))
-    assert await recover(author.folder) == []
+    assert await recover(author.folder) == [*author.records[:kept], lost(kept + 1, 1, kept + 1)]
+    assert any(tail for _, tail in tails(author.folder, scan(author.folder, RECORDER)))
 
 
 async def test_a_record_of_another_file_that_reused_blocks_still_hold_is_not_read(author: FolderWriter) -> None:
@@ -205,55 +180,41 @@ async def test_damage_is_reported_with_file_and_offset_and_changes_nothing(autho
     assert [each.alive for each in Spool(author.folder.parent).recorders()] == [False]
 
 
-async def test_a_commit_in_a_later_segment_proves_damage_in_an_earlier_one(author: FolderWriter) -> None:
-    author.put(started())
-    for _ in range(5):
-        author.put(node(), b"x" * 900)
-    author.sync()
-    path, offset, _ = author.places[3]
-    overwrite(path, offset, b"\0")
-    with pytest.raises(SpoolDamaged) as damage:
-        open_dead(author.folder)
-    assert (damage.value.path, damage.value.offset) == (path, offset)
+def change_a_record(author: FolderWriter) -> None:
+    overwrite(author.places[1][0], author.places[1][1], second_frame(b"x" * 899 + b"y"))
 
 
-async def test_a_missing_segment_among_synced_ones_is_damage(author: FolderWriter) -> None:
+DAMAGES: dict[str, Callable[[FolderWriter], None]] = {
+    "position 4 is missing, although the commit frame": lambda author: overwrite(*author.places[3][:2], b"\0"),
+    "position 5 is missing": lambda author: author.segments[1].unlink(),
+    "differ from those that were synced": change_a_record,
+    "event 13 of episode": lambda author: overwrite(
+        author.segments[-1],
+        author.end,
+        encode(Frame(EVENT, 1, 11, 13, WALL_NS, 1, episode(1), b"NodeStarted", b"{}"), salt_of(RECORDER, 3)),
+    ),
+}
+
+
+@pytest.mark.parametrize("reason", DAMAGES)
+def test_what_no_power_cut_leaves_is_damage_with_its_reason(author: FolderWriter, reason: str) -> None:
     author.put(started())
-    for _ in range(8):
+    for _ in range(9):
         author.put(node(), b"x" * 900)
     author.sync()
     assert len(author.segments) == 3
-    author.segments[1].unlink()
-    with pytest.raises(SpoolDamaged, match="position 5 is missing"):
-        open_dead(author.folder)
+    DAMAGES[reason](author)
+    with pytest.raises(SpoolDamaged, match=reason):
+        open_dead(author.folder, check=True)
 
 
-async def test_an_unreadable_header_is_damage_when_the_segments_before_it_are_deleted(author: FolderWriter) -> None:
+def test_an_unreadable_header_is_damage_when_the_segments_before_it_are_deleted(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(4):
         author.put(node(), b"x" * 900)
     author.segments[0].unlink()
     overwrite(author.segments[1], 60, b"#")
     with pytest.raises(SpoolDamaged, match="header is unreadable"):
-        open_dead(author.folder)
-
-
-async def test_a_record_that_differs_from_the_synced_one_is_damage(author: FolderWriter) -> None:
-    author.put(started())
-    author.put(node(), b"was written")
-    author.sync()
-    path, offset, _ = author.places[1]
-    other = second_frame(b"was forged!")
-    overwrite(path, offset, other)
-    with pytest.raises(SpoolDamaged, match="differ from those that were synced"):
-        open_dead(author.folder)
-
-
-async def test_a_gap_in_the_sequence_of_an_episode_is_damage(author: FolderWriter) -> None:
-    author.put(started())
-    forged = second_frame(b"{}", sequence=3)
-    overwrite(author.segments[0], author.end, forged)
-    with pytest.raises(SpoolDamaged, match="event 3 of episode"):
         open_dead(author.folder)
 
 
@@ -429,18 +390,6 @@ async def test_a_sealing_that_was_killed_anywhere_can_be_repeated(author: Folder
     assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
 
 
-async def test_a_released_live_queue_has_no_tail(spool: Path) -> None:
-    queue = make(spool)
-    queue.put_nowait(started(), b"{}")
-    queue.release()
-    recovered = open_dead(queue.folder, check=True)
-    assert recovered is not None
-    assert len(await drain(recovered)) == 2
-    recovered.release()
-    result = scan(queue.folder, parse_folder_name(queue.name).recorder)
-    assert [tail for _, tail in tails(queue.folder, result) if tail] == []
-
-
 # === dead source incremental ==================================================================================
 #
 # Records of a dead recorder are supplied while the rest of its folder is still being scanned, if that is safe.
@@ -563,17 +512,3 @@ async def test_records_that_a_later_commit_frame_contradicts_are_not_supplied(
     other = long_folder(tmp_path / "other", synced=[first, 18], letter=b"y")
     shutil.copyfile(other.segments[1], author.segments[1])  # whole frames of the same recorder and segment
     assert await supplied_before_damage(author.folder) == author.records[:first]
-
-
-async def test_the_next_source_supplies_again_what_was_not_deleted(spool: Path) -> None:
-    author = long_folder(spool)
-    for count in (3, 9):
-        recovered = open_dead(author.folder)
-        assert recovered is not None
-        batch = await recovered.get_batch(events_max=count, bytes_max=2**22, age_s_max=0.0)
-        await recovered.acknowledge(batch[-1].position)
-        recovered.release()
-        assert batch == author.records[:count]
-    records = await recover(author.folder)
-    assert records == [*author.records[records[0].position - 1 :], lost(RECORDS + 1, 1, RECORDS + 1)]
-    assert 1 < records[0].position <= 10

@@ -73,8 +73,9 @@ def put(queue: RecorderQueue, count: int) -> None:
         queue.put_nowait(node(), b"%d" % number * 20)
 
 
-@pytest.mark.parametrize("displace", DELETIONS)
-@pytest.mark.parametrize("with_news", [True, False])
+@pytest.mark.parametrize(
+    ("displace", "with_news"), [*((each, False) for each in DELETIONS), (delete_the_folder, True), (delete_alive, True)]
+)
 async def test_a_queue_whose_files_were_deleted_says_so_and_acknowledges_nothing_more(
     tmp_path: Path, displace: Callable[[RecorderQueue], None], with_news: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -101,7 +102,7 @@ async def test_a_queue_whose_files_were_deleted_says_so_and_acknowledges_nothing
     assert (queue.folder / "mine").exists() == (displace is put_another_in_its_place)
 
 
-@pytest.mark.parametrize("displace", DELETIONS)
+@pytest.mark.parametrize("displace", [delete_the_folder, delete_the_segment])
 async def test_a_drainer_in_another_process_ends_with_the_recorder_of_deleted_files(
     tmp_path: Path, displace: Callable[[RecorderQueue], None]
 ) -> None:

@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
@@ -219,24 +217,6 @@ async def test_a_wait_for_a_full_disk_ends_soon_after_the_disk_has_space(
 # === capacity =================================================================================================
 #
 # Admission to the queue: files never exceed the limit, and the reserve is kept for reserved records.
-
-FIVE_SEGMENTS = Capacity(segment_bytes=1000, segments_max=5, reserve_bytes=500, episodes_max=10)
-
-
-@pytest.mark.slow
-@given(st.integers(1, 2000), st.integers(56, 856), st.integers(0, 5), st.integers(0, 10), st.integers(1, 100))
-def test_an_admitted_ordinary_record_is_also_admitted_as_reserved_and_with_more_space(
-    frame_bytes: int, offset: int, spare: int, episodes: int, more: int
-) -> None:
-    if FIVE_SEGMENTS.admits(frame_bytes, offset=offset, spare=spare, episodes=episodes, reserved=False):
-        assert FIVE_SEGMENTS.admits(frame_bytes, offset=offset, spare=spare, episodes=episodes, reserved=True)
-        assert FIVE_SEGMENTS.admits(frame_bytes, offset=offset, spare=spare + more, episodes=episodes, reserved=False)
-
-
-def test_settings_under_which_a_full_queue_could_never_be_emptied_are_refused() -> None:
-    with pytest.raises(CallerError, match="three segments"):
-        Capacity.of(Settings(segment_bytes=1000, spool_bytes_max=4000, spool_reserve_bytes=1001))
-
 
 # The largest record: a header of 64 bytes, a type name of 255, the payload and padding; two commits of 72 after it; and
 # before it the segment header, 56 bytes and 40 for each open episode.

@@ -16,7 +16,7 @@ import pytest
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import InternalError, SpoolClosed, SpoolFull
-from pycrorm_async.queue import RecorderQueue, Spool, open_dead
+from pycrorm_async.queue import RecorderQueue, Spool
 from pycrorm_async.queue.format import Segment
 from pycrorm_async.queue.locks import FileLock, is_locked
 from pycrorm_async.queue.sync_thread import Notifier
@@ -53,11 +53,6 @@ def test_a_lock_has_one_holder_and_can_be_taken_after_its_release(tmp_path: Path
     second = FileLock.take(path, create=False)
     assert second is not None
     second.release()
-
-
-def test_a_missing_lock_file_is_made_only_on_request(tmp_path: Path) -> None:
-    assert FileLock.take(tmp_path / "alive", create=False) is None
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_kernel_releases_the_lock_of_a_killed_holder(tmp_path: Path) -> None:
@@ -187,28 +182,6 @@ async def test_a_child_that_releases_its_queue_takes_nothing_from_the_parent(que
     queue.put_nowait(ended(), b"{}")
     queue.close()
     assert await drain(queue) == [record(1, started(), 1, b"{}"), record(2, ended(), 2, b"{}")]
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_child_that_outlives_the_parent_does_not_keep_the_parents_folder_alive(spool: Path) -> None:
-    queue = make(spool)
-    queue.put_nowait(started(), b"{}")
-    begin_read, begin_write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.read(begin_read, 1)
-        os._exit(0)
-    try:
-        queue.release()
-        assert [each.alive for each in Spool(spool).recorders()] == [False]
-        recovered = open_dead(queue.folder)
-        assert recovered is not None
-        recovered.release()
-    finally:
-        os.write(begin_write, b"x")
-        os.waitpid(child, 0)
-        os.close(begin_read)
-        os.close(begin_write)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

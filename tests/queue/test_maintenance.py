@@ -189,17 +189,6 @@ async def test_an_unreadable_header_after_deleted_files_costs_only_the_ends_that
     assert records[-1] == lost(9, 1, 8)
 
 
-async def test_a_repaired_folder_that_is_damaged_again_is_reported(author: FolderWriter) -> None:
-    for heading in (started(1), started(2), *[node(1)] * 3, *[node(2)] * 3):
-        author.put(heading)
-    author.sync()
-    damage(author, 3)
-    repair(author.folder)
-    overwrite(author.folder / "00000001.segment", 56 + 70, b"#")
-    with pytest.raises(SpoolDamaged):
-        scan(author.folder, RECORDER)
-
-
 # --- refusals ---------------------------------------------------------------------------------------------------
 
 

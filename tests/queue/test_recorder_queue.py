@@ -2,24 +2,19 @@
 
 import asyncio
 import os
-import signal
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.queue import RecorderQueue, Spool
 from pycrorm_async.queue.format import COMMIT, EVENT, Segment, decode_each, header_bytes, salt_of
 from pycrorm_async.queue.locks import FileLock
-from pycrorm_async.record.episode_writer import EventSink
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.drain import Source
 from tests.queue.factories import (
     DECLARED,
     LONG_S,
@@ -40,13 +35,6 @@ from tests.queue.factories import (
 # === recorder queue ===========================================================================================
 #
 # The live queue: positions and sequences, safety levels, batches and acknowledging.
-
-
-def test_a_recorder_queue_implements_the_ports_of_hooks_and_writer(queue: RecorderQueue) -> None:
-    sink: EventSink = queue
-    source: Source = queue
-    assert sink.full is False
-    assert source.name == queue.folder.name
 
 
 async def test_records_come_back_in_the_order_of_their_puts(queue: RecorderQueue) -> None:
@@ -252,56 +240,6 @@ async def test_bytes_spooled_counts_headers_records_and_commits(tmp_path: Path) 
         queue.put_nowait(node(), b"x" * 900)
     assert queue.bytes_spooled == 4096 + 96 + 976
     queue.release()
-
-
-async def settle(queue: RecorderQueue) -> None:
-    """Wait until the sync thread has had two turns."""
-    for _ in range(2):
-        queue.put_nowait(DECLARED, b"{}")
-        await queue.synced_to()
-
-
-async def until(reached: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
-        while not reached():  # noqa: ASYNC110  # what it waits for is a file
-            await asyncio.sleep(0.001)
-
-
-INTERRUPTS = 2_000
-
-
-@pytest.mark.slow
-async def test_an_interrupt_in_the_middle_of_a_put_leaves_a_whole_queue(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12), clock=SYSTEM_CLOCK)
-    queue.put_nowait(started(), b"{}")
-    returned = 0
-
-    class Interrupted(BaseException):
-        pass
-
-    def interrupt(number: int, frame: object) -> None:
-        raise Interrupted
-
-    before = signal.signal(signal.SIGALRM, interrupt)
-    interrupts = 0
-    try:
-        while interrupts < INTERRUPTS:
-            try:
-                signal.setitimer(signal.ITIMER_REAL, 0.000_05 + (interrupts % 97) * 0.000_001)
-                while True:
-                    queue.put_nowait(node(), b"x" * 100)
-                    returned += 1
-            except Interrupted:
-                interrupts += 1
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    queue.close()
-    records = await drain(queue)
-    queue.release()
-    assert [each.position for each in records] == list(range(1, len(records) + 1))
-    assert [each.sequence for each in records] == list(range(1, len(records) + 1))
-    assert returned + 1 <= len(records) <= returned + 1 + INTERRUPTS
 
 
 async def test_after_a_sync_as_many_bytes_are_made_writable_as_the_records_before_took(

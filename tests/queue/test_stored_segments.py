@@ -196,15 +196,6 @@ async def test_a_segment_that_cannot_be_kept_is_deleted(bound: Path, caplog: pyt
     assert "cannot be kept, so it is deleted: Not a directory" in caplog.text
 
 
-async def test_open_episodes_are_known_from_the_first_kept_segment(bound: Path) -> None:
-    await live(bound)
-    folder = bound / "stored" / "a-log" / stored_files(bound)[0][0]
-    (folder / "00000001.segment").unlink()
-    left = scan(folder, RECORDER[:-1] + b"\1")
-    assert (left.start.position > 0, left.cut.position, left.open) == (True, 11, {})
-    assert episode(1) not in left.open
-
-
 async def test_each_segment_begins_with_the_declarations_in_use_and_can_be_read_alone(bound: Path) -> None:
     queue = make(bound)
     queue.put_nowait(DECLARED, b'{"dtype":"A"}')

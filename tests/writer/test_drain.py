@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import random
 import sqlite3
 import threading
 from collections.abc import Mapping, Sequence
@@ -296,22 +294,6 @@ async def test_a_drain_cancelled_at_any_point_loses_nothing(log: EventLog, point
     assert rest.kept == []
 
 
-async def test_a_drain_cancelled_at_any_moment_loses_nothing(log: EventLog) -> None:
-    seed = int.from_bytes(os.urandom(4))
-    print(f"seed {seed}")
-    chance = random.Random(seed)
-    source = KeptSource(run_of(episode(1), 1, 400), closed=True)
-    for _ in range(25):
-        running = asyncio.create_task(Drain(source, log.append, settings=TENS).run())
-        await asyncio.sleep(chance.uniform(0, 0.01))
-        running.cancel()
-        await asyncio.wait([running])
-        source = source.reopened()
-    await Drain(source, log.append, settings=TENS).run()
-    assert ask(log.address.path, STORED) == [(1, 400, 1, 400)]
-    assert source.kept == []
-
-
 async def test_uninterruptible_work_is_completed_even_when_it_is_cancelled_twice() -> None:
     may_end, ended = threading.Event(), threading.Event()
 
@@ -491,22 +473,6 @@ async def test_a_database_that_stays_locked_during_the_fold_is_raised_and_stored
     destination.release()
     assert (destination.folds, source.kept) == (5, [])
     assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 0)]
-
-
-async def test_a_query_for_stopped_episodes_on_an_unavailable_database_is_retried(log: EventLog) -> None:
-    class UnavailableTwice(ForwardingDestination):
-        requests = 0
-
-        async def stopped(self) -> Mapping[str, str]:
-            self.requests += 1
-            if self.requests < 3:
-                raise DatabaseUnavailable("the connection was closed")
-            return await super().stopped()
-
-    destination = UnavailableTwice(CountingFold(log))
-    source = KeptSource([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True)
-    recovered = await drain_once([source], destination, settings=SETTINGS)
-    assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}
 
 
 # === retry ====================================================================================================

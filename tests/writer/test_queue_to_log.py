@@ -16,7 +16,6 @@ from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.operations.recovery import dead_queues
 from pycrorm_async.queue.recorder_queue import RecorderQueue
-from pycrorm_async.queue.sources import open_dead
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
@@ -167,22 +166,6 @@ async def test_a_refused_episode_without_dead_letters_ends_the_wait_for_space_of
         await writer.close()
     queue.release()
     assert [each.path for each in Spool(tmp_path / "spool").recorders()] == [queue.folder]
-
-
-async def test_the_folder_of_a_dead_recorder_is_stored_in_one_round(tmp_path: Path, log: EventLog) -> None:
-    queue = queue_in(tmp_path / "spool")
-    for number in range(1, 501):
-        queue.put_nowait(kind(episode(1), number), payload(number))
-    queue.close()
-    queue.release()  # no drainer took it
-    recovered = open_dead(queue.folder)
-    assert recovered is not None
-    report = await drain_once([recovered], CountingFold(log), settings=SETTINGS)
-    recovered.release()
-    assert (report.failed, report.stopped, report.folded) == ({}, {}, 501)
-    assert ask(log.address.path, STORED) == [(1, 501, 1, 501)]  # recovery added the end with the status LOST
-    [[last]] = ask(log.address.path, "SELECT payload FROM event WHERE sequence = 501")
-    assert last == '{"status":"LOST"}'
 
 
 # === recovery =================================================================================================
