@@ -1,22 +1,17 @@
 """Perform real plans in a real world: the memory has the task tree and the world of every moment.
 
-The tests keep their own oracle while the plan runs: observers that query the world and the nodes of the plan, and
-actions that save the state of the world in the middle of a plan.
+The oracle are actions that save the state of the world in the middle of a plan.
 """
 
 from __future__ import annotations
 
 import asyncio
-import itertools
-from collections.abc import Awaitable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from pycrorm_async import Memory, Settings
+from pycrorm_async import Memory
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, monotonic_ns
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.plan import (
@@ -25,139 +20,18 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
-    PlaceActionPerformable,
-    PlanFailure,
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.execution import PlanObserver, recorder
 from pycrorm_async.plan.objects import designator_of
-from pycrorm_async.plan.task import TaskTreeNode as Node
-from pycrorm_async.query.snapshot import Moment, WorldThen
+from pycrorm_async.query.snapshot import WorldThen
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldState, current_world
 from tests.promises.chronicle import joints_of_bullet, numbers
-from tests.promises.lab import WITHIN_REACH, FailingActionPerformable, lab, url_of
+from tests.promises.lab import WITHIN_REACH, lab, url_of
 
 pytestmark = pytest.mark.slow
 
 ARM = "l_gripper_tool_frame"
-
-
-class StateObserver:
-    """Observe every change of nodes and world after the memory did, and note the state that results.
-
-    The observer queries only the objects that a change touches; the rest is as it was at the change before.
-    """
-
-    def __init__(self, behind: PlanObserver) -> None:
-        self.behind = behind
-        self.notes: list[tuple[list[tuple[str, str, str | None]], dict[str, Any]]] = []
-        self._nodes: list[Node] = []
-        self._things: dict[str, dict[str, Any]] = {}
-
-    def _note(self) -> None:
-        tree = [(_dtype(node), node.status.name, _dtype(node.parent) if node.parent else None) for node in self._nodes]
-        self.notes.append((tree, {name: dict(facts) for name, facts in self._things.items()}))
-
-    def admit(self) -> Awaitable[None] | None:
-        return self.behind.admit()
-
-    def node_started(self, node: Node) -> None:
-        self.behind.node_started(node)
-        self._nodes.append(node)
-        self._note()
-
-    def node_ended(self, node: Node) -> None:
-        self.behind.node_ended(node)
-        self._note()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.behind, name)
-
-    def object_added(self, added: Object) -> None:
-        self._things[added.name] = {"pose": numbers(added.pose), "joints": added.joint_positions(), "on": None}
-        self._note()
-
-    def object_removed(self, removed: Object) -> None:
-        del self._things[removed.name]
-        self._note()
-
-    def object_moved(self, moved: Object) -> None:
-        self._things[moved.name]["pose"] = numbers(moved.pose)
-        self._note()
-
-    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
-        self._things[moved.name]["joints"] = moved.joint_positions()
-        self._note()
-
-    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        self._things[child.name]["on"] = (parent.name, link)
-        self._note()
-
-    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        self._things[child.name]["on"] = None
-        self._note()
-
-
-def _dtype(node: Node) -> str:
-    assert node.designator is not None
-    return type(node.designator).__dtype__
-
-
-def state_at(then: Moment) -> tuple[list[tuple[str | None, str, str | None]], dict[str, Any]]:
-    """Return the same state from a snapshot, without the episode's root."""
-    dtypes = {each.id: each.dtype for each in then.tree}
-    nodes = sorted(then.tree, key=lambda each: each.sequence)[1:]
-    tree = [(each.dtype, each.status, dtypes[each.parent_id or 0]) for each in nodes]
-    objects_by_name = {
-        each.name: {"pose": numbers(each.pose), "joints": each.joints, "on": each.attached_to}
-        for each in then.world.objects
-    }
-    return tree, objects_by_name
-
-
-@contextmanager
-def observed() -> Iterator[StateObserver]:
-    """Place a state observer between the plans of this context and their memory."""
-    behind = recorder.get()
-    assert behind is not None
-    keeper = StateObserver(behind)
-    token = recorder.set(keeper)
-    try:
-        yield keeper
-    finally:
-        recorder.reset(token)
-
-
-async def test_snapshots_equal_the_observed_tree_and_world_after_every_event_of_a_plan(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path), settings=Settings(sample_interval_ms=1)) as memory:
-        async with memory.episode(description="a test") as episode:
-            with observed() as keeper, lab(keeper) as scene:
-                spoon = Object("spoon", ObjectType.SPOON, pose=Pose([1.3, 1, 1.05]))
-                await (ParkArmsActionPerformable(Arms.RIGHT) | MoveTorsoActionPerformable(0.1)).perform()
-                await NavigateActionPerformable(WITHIN_REACH).perform()
-                scene.milk.attach(spoon)
-                await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
-                await NavigateActionPerformable(Pose([0.5, 0.8, 0], (0, 0, 0.6, 0.8))).perform()
-                with pytest.raises(PlanFailure):
-                    await (FailingActionPerformable(PlanFailure("no")) + MoveTorsoActionPerformable(0.3)).perform()
-                await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([0.9, 1.2, 0.9])).perform()
-                spoon.remove()
-                scene.cereal.remove()
-                Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([2, 2, 0]))
-                scene.world.reset()
-        await memory.flush()
-        assert memory.status.faults.total == 0
-        end = await memory.as_of(episode, time=1e9)
-        moments = [await memory.as_of(episode, sequence=each) for each in range(1, end.sequence + 1)]
-    # The events begin and end with the episode and its root, and the world is left before the end.
-    changes = [then for before, then in itertools.pairwise(moments) if state_at(before) != state_at(then)]
-    assert len(keeper.notes) > 60
-    expected = [note for before, note in zip([([], {}), *keeper.notes], keeper.notes, strict=False) if before != note]
-    assert [state_at(then) for then in changes[: len(expected)]] == expected
-    assert (end.status, end.tree[0].status, end.world.objects) == ("SUCCEEDED", "SUCCEEDED", ())
-    assert {then.status for then in moments[:-1]} == {"RUNNING"}
-    assert [then.time_s for then in moments] == sorted(then.time_s for then in moments)
 
 
 @dataclass

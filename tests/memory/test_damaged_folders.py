@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory, recover
-from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.codec import Heading, encode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, ObjectAdded, PoseValue
 from pycrorm_async.operations.daemon import Folders
@@ -62,22 +61,6 @@ async def test_the_daemon_reports_damage_once_and_stores_what_a_repair_keeps_of_
     running = Daemon(database_url, spool)
     await running.wait_for_line(r"is recovered \(1 episode LOST\)")
     await running.stop()
-    assert ask(database_url, STORED) == [(13, 13)]
-    assert Spool(spool).recorders() == []
-
-
-async def test_one_round_reports_damage_and_stores_what_a_repair_keeps_of_the_rest(
-    database_url: str, spool: Path, damaged: FolderWriter
-) -> None:
-    for _ in range(2):
-        report = await recover(database_url, spool=spool)
-        [(name, fault)] = report.failed.items()
-        assert (name, isinstance(fault, SpoolDamaged), MISSING in str(fault)) == (damaged.folder.name, True, True)
-        assert (report.lost, report.drained.stopped) == ((), {})
-        assert ask(database_url, STORED) == [(12, 12)]
-    assert repair_folder(damaged.folder) is not None
-    report = await recover(database_url, spool=spool)
-    assert (report.failed, len(report.lost)) == ({}, 1)
     assert ask(database_url, STORED) == [(13, 13)]
     assert Spool(spool).recorders() == []
 

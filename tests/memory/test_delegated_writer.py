@@ -4,7 +4,6 @@ import asyncio
 import logging
 import shutil
 import sqlite3
-import threading
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -239,29 +238,6 @@ async def test_a_refused_episode_is_reported_and_kept_and_stored_by_a_later_daem
         assert sorted(await texts(reading)) == ["a", "b", "c", "d"]
 
 
-async def test_one_round_reports_to_a_live_recorder_its_refused_and_parked_episodes(
-    database_url: str, spool: Path
-) -> None:
-    settings = replace(QUICKLY_SYNCED, connect_timeout_s=60)
-    async with Memory.open(database_url, spool=spool, settings=settings) as memory:
-        async with memory.episode(description="of another"):
-            await NoteActionPerformable("a").perform()
-        await memory.flush()
-    ask_to_change(database_url, "UPDATE episode SET parked = 'long ago'")
-    async with memory_at(database_url, spool) as memory, memory.episode(description="parked") as parked:
-        await NoteActionPerformable("b").perform()
-        await memory.synced()
-        await recover(database_url, spool=spool)
-        await memory.flush()
-        ask_to_change(database_url, "UPDATE episode SET parked = 'by hand' WHERE number = 2")
-        await NoteActionPerformable("c").perform()
-        await memory.synced()
-        await recover(database_url, spool=spool)
-        with pytest.raises(EpisodeParked) as caught:
-            await memory.flush()
-        assert caught.value.reasons == {str(parked): "by hand"}
-
-
 # === daemon faults ============================================================================================
 #
 # A daemon on a database that is replaced, locked or foreign, on a damaged folder, or beside another daemon.
@@ -290,34 +266,6 @@ async def test_a_daemon_ends_when_its_database_file_is_replaced_and_waits_when_t
     assert not any("Traceback" in line for line in started.lines)
     report = await recover(url, spool=spool)
     assert report.failed == {}
-
-
-async def test_a_daemon_that_is_cancelled_during_a_scan_leaves_the_folders_to_the_next(
-    database_url: str, spool: Path, daemon: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looking, cancelled = threading.Event(), threading.Event()
-
-    take = LiveSource.take
-
-    def take_late(folder: Path) -> LiveSource | None:
-        looking.set()
-        assert cancelled.wait(60)
-        return take(folder)
-
-    async with memory_at(database_url, spool) as memory:
-        await NoteActionPerformable("a").perform()
-        with monkeypatch.context() as patch:
-            patch.setattr(LiveSource, "take", take_late)
-            first = Daemon(database_url, spool)
-            assert await asyncio.to_thread(looking.wait, 60)
-            first.task.cancel()
-            cancelled.set()
-            with pytest.raises(asyncio.CancelledError):
-                await first.task
-        assert not memory.status.drained
-        async with daemon():
-            await memory.flush()
-            assert await texts(memory) == ["a"]
 
 
 @pytest.mark.parametrize(

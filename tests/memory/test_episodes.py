@@ -465,37 +465,6 @@ async def test_a_world_that_is_entered_inside_an_episode_is_described(database_u
     ]
 
 
-@pytest.mark.soak_on("postgresql")
-@pytest.mark.soak_on("sqlite")
-async def test_the_world_of_an_episode_that_runs_or_is_lost_is_that_of_its_objects(
-    database_url: str, tmp_path: Path
-) -> None:
-    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
-
-        async def world() -> str | None:
-            await memory.flush()
-            return (await memory.reading.episode("last")).world
-
-        with BulletWorld():
-            Object("cup", ObjectType.JEROEN_CUP)  # in no episode
-        async with memory.episode(description="running"):
-            assert await world() is None
-            with BulletWorld() as entered:
-                assert await world() is None
-                Object("pr2", ObjectType.ROBOT)
-                bowl = Object("bowl", ObjectType.BOWL)
-                assert await world() == "pr2 (ROBOT), bowl (BOWL)"
-                bowl.remove()
-                milk = Object("milk", ObjectType.MILK)
-                assert await world() == "pr2 (ROBOT), milk (MILK)"
-                milk.remove()
-                Object("milk", ObjectType.MILK).set_pose(Pose([1, 0, 0]))
-                assert await world() == "pr2 (ROBOT), milk (MILK)"
-                entered.object("pr2").remove()
-            assert await world() == "pr2 (ROBOT), bowl (BOWL), milk (MILK)"
-        assert await world() == f"BulletWorld (DIRECT, {ENGINE}): milk (MILK)"
-
-
 @pytest.mark.slow
 def test_a_plans_process_starts_no_git_on_its_own(tmp_path: Path) -> None:
     program = """

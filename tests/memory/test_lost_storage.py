@@ -357,35 +357,6 @@ async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
 
 
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.soak_on("sqlite")
-async def test_a_lost_episode_of_a_dead_recorder_ends_lost_again(
-    database_url: str, spool: Path, take_backup: TakeBackup, tmp_path: Path
-) -> None:
-    async with memory_at(database_url, spool) as memory:
-        await note(memory, "first")
-        await memory.flush()
-    backup = take_backup()
-    elsewhere = tmp_path / "copy"
-    async with memory_at(database_url, spool) as memory, memory.episode(description="broken off"):
-        await NoteActionPerformable("half").perform()
-        await memory.synced()
-        [folder] = [each for each in spool.iterdir() if (each / "alive").exists()]
-        shutil.copytree(folder, elsewhere / folder.name)
-    backup.restore()
-    shutil.rmtree(spool / "stored")
-    (elsewhere / folder.name).rename(spool / folder.name)
-    report = await recover(database_url, spool=spool, settings=QUICKLY_SYNCED)
-    assert len(report.lost) == 1
-    stored = everything(database_url)
-    backup.restore()
-    report = await recover(database_url, spool=spool, settings=QUICKLY_SYNCED)
-    assert everything(database_url) == stored
-    assert ask(database_url, "SELECT status FROM process_metadata ORDER BY id") == [("SUCCEEDED",), ("LOST",)]
-    assert (report.drained.stopped, report.failed) == ({}, {})
-    assert await is_clean(database_url)
-
-
-@pytest.mark.soak_on("postgresql")
 async def test_an_idle_daemon_stores_again_what_dead_recorders_had_stored(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:

@@ -110,36 +110,6 @@ async def test_simulations_are_left_out_unless_they_are_asked_for(tmp_path: Path
     assert "simulated in episodes 2, 3" in pycrorm("show", "last", *url, cwd=tmp_path).stdout
 
 
-async def test_simulations_without_an_episode_are_recorded_too(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with SimulatedTaskTree(description="what if"):
-            await NoteActionPerformable("thought").perform()
-        await NoteActionPerformable("real").perform()
-        await memory.flush()
-        assert await texts(memory) == ["real"]
-        assert [each.description for each in await memory.reading.episodes()] == ["NoteAction"]
-        both = await memory.reading.episodes(simulated=True)
-        assert [(each.description, each.simulated, each.thought_by) for each in both] == [
-            ("what if", True, None),
-            ("NoteAction", False, None),
-        ]
-        async with memory.session(simulated=True) as session:
-            assert len((await session.scalars(select(Action))).all()) == 2
-        assert len(await memory.dataframe(select(TaskTreeNode), simulated=True)) == 4
-        assert len(await memory.dataframe(select(TaskTreeNode))) == 2
-
-
-async def test_a_memory_opened_in_a_simulation_records_simulations(tmp_path: Path) -> None:
-    with SimulatedTaskTree():
-        async with Memory.open(url_of(tmp_path)) as memory:
-            await NoteActionPerformable("a").perform()
-            async with memory.episode(description="in a thought"):
-                await NoteActionPerformable("b").perform()
-    async with Reading.open(url_of(tmp_path)) as reading:
-        assert await reading.episodes() == []
-        assert {each.simulated for each in await reading.episodes(simulated=True)} == {True}
-
-
 async def test_a_memory_closed_in_a_simulation_ends_it(tmp_path: Path) -> None:
     with SimulatedTaskTree():
         async with Memory.open(url_of(tmp_path)):

@@ -210,23 +210,6 @@ async def test_a_hangup_and_a_termination_of_the_process_alone_do_not_end_it(tmp
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_two_memories_of_one_database_have_a_process_each_and_store_everything_once(
-    database_url: str, tmp_path: Path
-) -> None:
-    async def record(name: str) -> None:
-        async with opened(database_url, tmp_path / "spool") as memory:
-            for number in range(200):
-                await NoteActionPerformable(f"{name}{number:03}").perform()
-                await asyncio.sleep(0)
-            await memory.flush()
-            assert len(processes()) >= 1
-
-    await asyncio.gather(record("a"), record("b"))
-    assert sorted(text for (text,) in ask(database_url, NOTES)) == [f"{n}{i:03}" for n in "ab" for i in range(200)]
-    assert (processes(), Spool(tmp_path / "spool").recorders()) == ([], [])
-
-
-@pytest.mark.soak_on("postgresql")
 async def test_a_process_leaves_other_living_recorders_to_their_writers_and_drains_dead_ones(
     tmp_path: Path, database_url: str, daemon: Start, spool: Path
 ) -> None:

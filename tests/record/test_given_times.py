@@ -253,19 +253,6 @@ async def test_a_name_and_its_samples_are_found_on_each_database_inside_a_loop(
             assert [each.status for each in await memory.episodes()] == ["SUCCEEDED", "UNKNOWN"]
 
 
-def test_an_import_runs_beside_a_live_memory(tmp_path: Path) -> None:
-    with opened(tmp_path) as live, live.recording.episode(description="live") as episode:
-        episode.observe("before", 1)
-        with opened(tmp_path) as memory:
-            record_drives(memory.recording, "drives.log", 3)
-        episode.observe("after", 2)
-    assert_verified(tmp_path)
-    assert rows(tmp_path, "SELECT description, status FROM process_metadata ORDER BY description") == [
-        ("an import", "SUCCEEDED"),
-        ("live", "SUCCEEDED"),
-    ]  # by number they come in the order in which they were stored
-
-
 def test_two_processes_that_record_one_name_are_refused_in_one_line(tmp_path: Path) -> None:
     hasty = Settings(fold="at_end", flush_timeout_s=0.5)
     with opened(tmp_path) as first:

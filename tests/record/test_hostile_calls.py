@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.world import ObjectType
 from pycrorm_async.world.pose import Pose
-from tests.record.recordings import AT_END, HERE, Recorded, assert_verified, events, nodes, record, url_of
+from tests.record.recordings import AT_END, HERE, Recorded, events, nodes, record, url_of
 
 # === hostile values ===========================================================================================
 #
@@ -246,42 +245,6 @@ def test_no_argument_of_an_end_raises(tmp_path: Path) -> None:
 # === hostile moments ==========================================================================================
 #
 # Calls at hostile moments: inside a lookup of another episode's key, or while the memory closes.
-
-
-def test_two_episodes_whose_values_call_each_other_do_not_wait_for_ever(tmp_path: Path) -> None:
-    class Ends:
-        """A key that ends a node of another episode while it is looked up, as the garbage collector may do."""
-
-        def __init__(self, other: RecordedEpisode, meet: threading.Barrier) -> None:
-            self.other, self.meet = other, meet
-
-        def __hash__(self) -> int:
-            try:
-                self.meet.wait(0.2)
-            except threading.BrokenBarrierError:
-                self.meet.reset()
-            self.other.end("n")
-            return 1
-
-    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
-        kind = memory.recording.type("action", "Step")
-        one, two = (memory.recording.episode(description=each) for each in ("one", "two"))
-        for each in (one, two):
-            each.start("n", kind)
-        meet = threading.Barrier(2)
-        threads = [
-            threading.Thread(target=lambda a=a, b=b: a.start(Ends(b, meet), kind), daemon=True)
-            for a, b in ((one, two), (two, one))
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(20)
-        assert not any(thread.is_alive() for thread in threads)
-        for each in (one, two):
-            each.close()
-    assert [row[2] for row in nodes(tmp_path)].count("SUCCEEDED") == 2
-    assert_verified(tmp_path)
 
 
 def test_an_episode_opened_after_closing_has_begun_is_counted_and_stays_empty(tmp_path: Path) -> None:

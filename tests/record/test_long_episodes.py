@@ -83,25 +83,6 @@ async def test_a_plan_goes_on_in_a_full_episode_and_each_recorded_node_has_its_e
     assert (await recover(url)).failed == {}
 
 
-def test_another_executive_goes_on_in_a_full_episode(tmp_path: Path) -> None:
-    with Memory.sync(f"sqlite:///{tmp_path}/memory.db", settings=LIMITED) as memory:
-        kind = memory.recording.type("action", "Step", {"number": int})
-        with memory.recording.episode(description="long") as episode:
-            episode.object_added("m", "milk", "MILK", Pose())
-            episode.start("outer", kind, {"number": -1})
-            for number in range(200):
-                episode.start(number, kind, {"number": number}, parent="outer")
-                episode.object_moved("m", Pose([number, 0, 0]), node=number)
-                episode.observe("n", number, node=number)
-                episode.end(number)
-            episode.end("outer")
-        memory.flush()
-        assert memory.status.faults.total > 0
-        nodes = memory.tree(1)
-        assert {each.status for each in nodes} == {"SUCCEEDED"}
-        assert [each.status for each in memory.episodes()] == ["SUCCEEDED"]
-
-
 def test_the_limit_on_the_events_of_an_episode_is_checked() -> None:
     assert Settings().episode_events_max == SEQUENCE_MAX
     for wrong in (0, 99, SEQUENCE_MAX + 1, 150.5):

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async import Memory, Settings
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.rebuild import rebuild_memory
@@ -87,24 +86,6 @@ def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> Non
     assert done.stderr.startswith("a call of `start` leaves no record, because this process was forked"), done.stderr
     assert done.stderr.count("\n") == 1
     assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
-
-
-@pytest.mark.slow
-@pytest.mark.every_python
-def test_a_full_spool_is_waited_for_by_a_thread(tmp_path: Path) -> None:
-    small = Settings(spool_bytes_max=2**20, spool_reserve_bytes=2**18, segment_bytes=2**16, record_bytes_max=2**14)
-    with Memory.sync(url_of(tmp_path), settings=small, writer="daemon") as memory:
-        kind = memory.recording.type("action", "Step", {"text": str})
-        with memory.recording.episode(description="d") as episode:
-            assert episode.wait_for_room(0.0)
-            for number in range(10_000):
-                if not episode.wait_for_room(0.0):
-                    break
-                episode.start(number, kind, {"text": "x" * 1_000})
-                episode.end(number)
-            assert number < 9_999
-            assert not episode.wait_for_room(0.05)
-        assert memory.status.faults == (0, None)
 
 
 # === contradicting processes ==================================================================================

@@ -193,22 +193,6 @@ async def test_a_simulation_ends_with_the_outcome_of_its_block_and_the_episode_c
     assert len(only(case.sink.of(real), NodeStarted)) == 2
 
 
-async def test_nested_simulations_each_name_the_node_of_the_one_around() -> None:
-    @dataclass
-    class ThinkTwiceActionPerformable(ActionAbstract):
-        async def perform(self) -> None:
-            with SimulatedTaskTree():
-                await ThinkActionPerformable("deep").perform()
-
-    with recorder_case() as case, case.episode() as real:
-        await ThinkTwiceActionPerformable().perform()
-    outer, inner = simulated_episodes(case)
-    assert started(case, outer).thought_by == NodeReference(episode_text(real.id), 3)
-    assert started(case, inner).thought_by == NodeReference(episode_text(outer), 3)
-    texts = [[each.parameters.get("text") for each in only(case.sink.of(name), NodeStarted)] for name in (outer, inner)]
-    assert texts == [[None, "deep", "real"], [None, "deep"]]
-
-
 async def test_simulations_in_two_tasks_mix_neither_with_each_other_nor_with_real_events() -> None:
     with recorder_case() as case, BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)

@@ -11,14 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select
 
 from pycrorm_async import Memory
-from pycrorm_async.clock import monotonic_ns
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.types import Happening, NodeEnded, NodeStarted, StateSampled
-from pycrorm_async.orm import Object as ObjectRow
-from pycrorm_async.orm import StateSample, TaskTreeNode
 from pycrorm_async.plan import (
     ActionAbstract,
     ChosenRobot,
@@ -159,37 +155,6 @@ async def test_a_cancelled_motion_ends_with_the_state_in_which_it_stopped(case: 
         await asyncio.sleep(0.02)
         assert len(samples(case)) == count
     assert values(case, "base.x") == [0.0, 0.25, 0.375]
-
-
-async def test_concurrent_motions_each_have_the_state_in_which_they_ended(case: RecorderCase) -> None:
-    first_ended = asyncio.Event()
-
-    async def drive(body: Object, target: Pose) -> None:
-        await seen(case, "base.z", 0.0)
-        if target.position.x:
-            body.set_pose(Pose([target.position.x, body.pose.position.y, 0]))
-            await seen(case, "base.x", 1.0)
-        else:
-            await first_ended.wait()
-            body.set_pose(Pose([body.pose.position.x, target.position.y, 0]))
-
-    async def first() -> None:
-        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-        first_ended.set()
-
-    with case.episode(), ChosenRobot("mine", Robot(drive)):
-        await asyncio.gather(first(), NavigateActionPerformable(Pose([0, 2, 0])).perform())
-    # A channel is written when it differs from its last value: the state at a moment is the last written one before it.
-    state: dict[str, float] = {}
-    ends: dict[int, dict[str, float]] = {}
-    for each in samples(case):
-        assert each.node is not None
-        state |= each.channels
-        ends.pop(each.node, None)
-        ends[each.node] = dict(state)
-    one, two = ends.values()  # by their last samples: a plan yields to the loop now and then, so either may start first
-    assert one["base.x"] == 1.0
-    assert (two["base.x"], two["base.y"]) == (1.0, 2.0)
 
 
 async def test_a_sample_without_space_is_left_out_and_the_next_one_has_all_changes_since_the_last_written(
@@ -359,83 +324,15 @@ async def test_a_thread_samples_only_on_request_and_ends_with_the_memory() -> No
         assert threads() == []
 
 
-# === state stream =============================================================================================
-#
-# A robot's trajectory during a motion, as a memory has it: times and positions, to the last bit.
-
-STEPS = 20
-SAMPLED_SELDOM = Settings(sample_interval_ms=2)
-
-
-class Driving:
-    """Move the base along x to its goal in 20 steps of 5 ms, and log the time and position of each step."""
-
-    def __init__(self) -> None:
-        self.log: list[tuple[int, float]] = []
-
-    async def navigate(self, motion: MoveMotion) -> None:
-        body = require_robot().body
-        start = body.pose.position.x
-        for step in range(1, STEPS + 1):
-            await asyncio.sleep(0.005)
-            x = start + (motion.target.position.x - start) * step / STEPS
-            body.set_pose(Pose([x, 0, 0]))
-            self.log.append((monotonic_ns(), x))
-
-    async def move_tcp(self, motion: object) -> None: ...
-    async def looking(self, motion: object) -> None: ...
-    async def move_gripper(self, motion: object) -> None: ...
-    async def move_arm_joints(self, motion: object) -> None: ...
-    async def move_joints(self, motion: object) -> None: ...
-
-
-@pytest.mark.slow
-async def test_a_trajectory_is_recorded_with_its_values_and_times(tmp_path: Path) -> None:
-    robot = Driving()
-    async with Memory.open(url_of(tmp_path), settings=SAMPLED_SELDOM) as memory:
-        with BulletWorld(), ChosenRobot("mine", robot):
-            body = Object("pr2", ObjectType.ROBOT)
-            joints = body.joint_positions()
-            async with memory.episode(description="driving"):
-                await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-        await memory.flush()
-        assert memory.status.faults.total == 0
-        assert memory.status.samples_left_out == 0
-        async with memory.session() as session:
-            motion = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.dtype == "MoveMotion"))).one()
-            rows = (await session.scalars(select(StateSample).order_by(StateSample.id, StateSample.channel))).all()
-            robot_row = await session.get(ObjectRow, rows[-1].object_id)
-    assert {row.node_id for row in rows} == {motion.id}
-    assert robot_row is not None
-    assert robot_row.name == "pr2"
-    assert motion.end_ns is not None
-
-    times = [row.ns for row in rows]
-    assert times == sorted(times)
-    assert motion.start_ns < times[0]
-    assert times[-1] < motion.end_ns
-
-    first = {row.channel: row.value for row in rows if row.id == rows[0].id}
-    base = {"base.x": 0.0, "base.y": 0.0, "base.z": 0.0, "base.qx": 0.0, "base.qy": 0.0, "base.qz": 0.0, "base.qw": 1.0}
-    assert first == base | joints
-    way = [(row.ns, row.value) for row in rows if row.channel == "base.x"]
-    assert all(row.channel == "base.x" for row in rows if row.id != rows[0].id)
-    assert [x for _, x in way] == sorted(
-        {x for _, x in way}
-    )  # the base never moved back, and no sample is written twice
-    assert way[-1][1] == 1.0
-    stations = [0.0, *(x for _, x in robot.log)]
-    for ns, value in way:
-        # The value in force when the sample was written, or the one before or after if a step fell in between.
-        so_far = sum(set_ns <= ns for set_ns, _ in robot.log)
-        assert value in stations[max(0, so_far - 1) : so_far + 2]
-
-
 @pytest.mark.slow
 async def test_a_memory_that_is_closed_during_a_motion_ends_its_thread(tmp_path: Path) -> None:
-    with BulletWorld(), ChosenRobot("mine", Driving()):
+    async def drive(body: Object, target: Pose) -> None:
+        await asyncio.sleep(0.1)
+        body.set_pose(target)
+
+    with BulletWorld(), ChosenRobot("mine", Robot(drive)):
         Object("pr2", ObjectType.ROBOT)
-        memory = Memory.open(url_of(tmp_path), settings=SAMPLED_SELDOM)
+        memory = Memory.open(url_of(tmp_path), settings=SAMPLED)
         await memory.__aenter__()
         driving = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
         async with asyncio.timeout(10):

@@ -122,24 +122,6 @@ async def test_a_stream_ends_with_the_memory_after_its_last_event(url: str) -> N
     assert [each.sequence for each in seen] == [1, 2, 3, 4, 5, 6]
 
 
-async def test_each_observer_gets_each_event_of_all_threads_once(url: str) -> None:
-    one: list[RecordedEvent] = []
-    other: list[RecordedEvent] = []
-    async with Memory.open(url) as memory:
-        with memory.subscribe(one.append), memory.subscribe(other.append):
-            await asyncio.gather(*(asyncio.to_thread(asyncio.run, many()) for _ in range(4)))
-    for seen in (one, other):
-        by_episode: dict[str, list[int]] = {}
-        for each in seen:
-            by_episode.setdefault(each.episode, []).append(each.sequence)
-        assert sorted(by_episode.values()) == [[1, 2, 3, 4, 5, 6]] * 100
-
-
-async def many() -> None:
-    for _ in range(25):
-        await SayActionPerformable("hello").perform()
-
-
 async def test_a_stream_whose_loop_is_closed_does_not_delay_the_plan(url: str) -> None:
     async with Memory.open(url) as memory:
 
