@@ -371,12 +371,7 @@ class _Tools:
         hexadecimal digits.
         """
         result = await (await self._open()).query(sql, _LIMITS)
-        rows, more = json_rows(result.rows), result.more
-        while True:
-            text = _json({"columns": result.columns, "rows": rows, "more_rows_exist": more})
-            if len(rows) < 2 or len(text.encode()) <= _ANSWER_BYTES:
-                return text
-            rows, more = rows[: len(rows) // 2], True
+        return _json({"columns": result.columns, "rows": json_rows(result.rows), "more_rows_exist": result.more})
 
     def question(self, name: str) -> _Function:
         """Return the tool of a question of `Ask`: its arguments and its description are those of the question."""

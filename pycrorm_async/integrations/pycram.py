@@ -144,8 +144,8 @@ KNOWN_VERSIONS: Final = ("1.0.4",)
 """The versions of the distribution `pycram-robotics` whose methods this module replaces."""
 _PYCRAM: Final = ForeignPackage("PyCRAM", extra="pycram", versions=KNOWN_VERSIONS)
 _SETTINGS: Final = Settings(fold="at_end", sync_interval_ms=250)
-_ACTIVE: Final[dict[int, object]] = {}
-"""The active `remember` by process id: only one, because it replaces methods; a forked child may have its own."""
+_ACTIVE: Final[set[int]] = set()
+"""The processes with an active `remember`: only one in each, because it replaces methods, also in a forked child."""
 
 
 @contextmanager
@@ -172,10 +172,11 @@ def remember(
         PycrormError: `Memory.open` raised it; no method of PyCRAM is replaced then.
     """
     _PYCRAM.check_version(_PYCRAM.installed_version("pycram-robotics"))
-    process, this = os.getpid(), object()
-    try:  # begins before `this` becomes active, because Ctrl-C may come directly after that
-        if _ACTIVE.setdefault(process, this) is not this:
-            raise CallerError("another `remember` is active in this process: leave its block, or perform inside it")
+    process = os.getpid()
+    if process in _ACTIVE:
+        raise CallerError("another `remember` is active in this process: leave its block, or perform inside it")
+    _ACTIVE.add(process)
+    try:
         labels = {"description": description, "plan": plan, "seed": seed, "tags": tags, "metadata": metadata}
         with (
             Memory.sync(url, spool=spool, writer=writer, settings=settings or _SETTINGS) as memory,
@@ -183,8 +184,7 @@ def remember(
         ):
             yield episode
     finally:
-        if process in _ACTIVE and _ACTIVE[process] is this:  # no call, so Ctrl-C cannot come before the next line
-            del _ACTIVE[process]
+        _ACTIVE.discard(process)
 
 
 class _PyCRAMPlans:

@@ -1,19 +1,15 @@
-"""The baseline has the shape of the system of the thesis, and both sides store the same facts."""
+"""The baseline has the shape of the system of the thesis."""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import pytest
 from sqlalchemy import Engine
 
 from bench.material.baseline import BaselineBase, Statements, engine_of, store
-from bench.material.rollouts import THESIS_NODES, Node, Place, Tree, WorldObject, spool_tree, tree, tree_of
-from pycrorm_async.operations.recovery import recover
+from bench.material.rollouts import THESIS_NODES, Tree, tree, tree_of
 from tests.databases import ask
 
 pytestmark = pytest.mark.slow
@@ -91,159 +87,3 @@ def test_fifty_thousand_rollouts_have_the_number_of_nodes_of_the_thesis() -> Non
 def test_the_same_seed_makes_the_same_tree_and_another_one_another() -> None:
     assert tree(500, seed=7) == tree(500, seed=7)
     assert tree(500, seed=7) != tree(500, seed=8)
-
-
-# --- the same facts on both sides -------------------------------------------------------------------------------------
-
-Fact = tuple[Any, ...]
-"""A node: type, start and end in µs, status, reason of its failure, its parent's start, then the values of its
-fields.
-"""
-
-
-class Stored(NamedTuple):
-    """The places of a designator's values: in a pose, in an object, in columns."""
-
-    pose: str | None
-    object: str | None
-    scalars: tuple[str, ...]
-
-
-IN_BASELINE = {
-    "NavigateAction": Stored("pose_id", None, ()),
-    "FaceAtAction": Stored("pose_id", None, ()),
-    "LookAtAction": Stored("pose_id", None, ()),
-    "PickUpAction": Stored(None, "object_id", ("arm", "grasp")),
-    "MoveMotion": Stored("pose_id", None, ()),
-    "LookingMotion": Stored("pose_id", None, ()),
-    "MoveTCPMotion": Stored("pose_id", None, ("arm", "allow_gripper_collision")),
-    "MoveGripperMotion": Stored(None, None, ("motion", "gripper", "allow_gripper_collision")),
-}
-IN_OURS = {
-    "NavigateAction": ("navigate_action", IN_BASELINE["NavigateAction"]._replace(pose="target_location_id")),
-    "FaceAtAction": ("face_at_action", IN_BASELINE["FaceAtAction"]),
-    "LookAtAction": ("look_at_action", IN_BASELINE["LookAtAction"]._replace(pose="target_id")),
-    "PickUpAction": ("pick_up_action", IN_BASELINE["PickUpAction"]._replace(object="object_designator_id")),
-    "MoveMotion": ("move_motion", IN_BASELINE["MoveMotion"]._replace(pose="target_id")),
-    "LookingMotion": ("looking_motion", IN_BASELINE["LookingMotion"]._replace(pose="target_id")),
-    "MoveTCPMotion": ("move_tcp_motion", IN_BASELINE["MoveTCPMotion"]._replace(pose="target_id")),
-    "MoveGripperMotion": ("move_gripper_motion", IN_BASELINE["MoveGripperMotion"]),
-}
-
-
-def expected(rollouts: Tree) -> list[Fact]:
-    """Return the facts of the values themselves."""
-    facts = []
-
-    def note(node: Node, parent_ns: int) -> None:
-        values = list(node.values.values())
-        place = next((each for each in values if isinstance(each, Place)), None)
-        world_object = next((each for each in values if isinstance(each, WorldObject)), None)
-        scalars = tuple(each for each in values if not isinstance(each, Place | WorldObject))
-        robot = (*_flat(node.robot.place), node.robot.torso_m) if node.robot else (None,) * 9
-        status = "FAILED" if node.failure else "SUCCEEDED"
-        times = (node.start_ns // 1000, node.end_ns // 1000)
-        object_values = (
-            (world_object.name, world_object.type, *_flat(world_object.place)) if world_object else (None,) * 10
-        )
-        facts.append(
-            (
-                node.dtype,
-                *times,
-                status,
-                node.failure,
-                parent_ns // 1000,
-                *robot,
-                *_flat(place),
-                *object_values,
-                *scalars,
-            )
-        )
-        for child in node.children:
-            note(child, node.start_ns)
-
-    for rollout in rollouts.rollouts:
-        note(rollout, rollouts.began_ns)
-    return sorted(facts, key=lambda fact: fact[1])
-
-
-def _flat(place: Place | None) -> Fact:
-    if place is None:
-        return (None,) * 8
-    return (*place.position, *place.orientation, place.time_ns // 1000)
-
-
-def stored_by_baseline(url: str) -> list[Fact]:
-    facts: list[Fact] = []
-    for dtype, (pose, object_column, scalars) in IN_BASELINE.items():
-        columns = ", ".join(f"leaf.{each}" for each in scalars)
-        statement = f"""
-            SELECT node.start_time, node.end_time, node.status, node.reason, parent.start_time,
-                rp.x, rp.y, rp.z, rq.x, rq.y, rq.z, rq.w, robot_pose.time, robot.torso_height,
-                p.x, p.y, p.z, q.x, q.y, q.z, q.w, pose.time,
-                object.name, object.obj_type, op.x, op.y, op.z, oq.x, oq.y, oq.z, oq.w, object_pose.time
-                {"," if columns else ""} {columns}
-            FROM TaskTreeNode AS node JOIN TaskTreeNode AS parent ON parent.id = node.parent_id
-            JOIN Designator AS designator ON designator.id = node.action_id AND designator.dtype = '{dtype}'
-            JOIN {dtype} AS leaf ON leaf.id = designator.id
-            LEFT JOIN Action AS action ON action.id = designator.id
-            LEFT JOIN RobotState AS robot ON robot.id = action.robot_state_id
-            LEFT JOIN Pose AS robot_pose ON robot_pose.id = robot.pose_id
-            LEFT JOIN Position AS rp ON rp.id = robot_pose.position_id
-            LEFT JOIN Quaternion AS rq ON rq.id = robot_pose.orientation_id
-            LEFT JOIN Pose AS pose ON pose.id = {f"leaf.{pose}" if pose else "NULL"}
-            LEFT JOIN Position AS p ON p.id = pose.position_id
-            LEFT JOIN Quaternion AS q ON q.id = pose.orientation_id
-            LEFT JOIN Object AS object ON object.id = {f"leaf.{object_column}" if object_column else "NULL"}
-            LEFT JOIN Pose AS object_pose ON object_pose.id = object.pose_id
-            LEFT JOIN Position AS op ON op.id = object_pose.position_id
-            LEFT JOIN Quaternion AS oq ON oq.id = object_pose.orientation_id"""
-        times = (0, 1, 4, 12, 21, 31)
-        facts += [
-            (dtype, *(_us(each) if place in times else each for place, each in enumerate(row)))
-            for row in ask(url, statement)
-        ]
-    return sorted(facts, key=lambda fact: fact[1])
-
-
-def _us(text: str | None) -> int | None:
-    if text is None:
-        return None
-    seconds, micros = divmod(round(datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp() * 1e6), 1_000_000)
-    return seconds * 1_000_000 + micros
-
-
-def stored_by_us(url: str) -> list[Fact]:
-    facts: list[Fact] = []
-    for dtype, (table, (pose, object_column, scalars)) in IN_OURS.items():
-        columns = ", ".join(f"leaf.{each}" for each in scalars)
-        flat = ", ".join(
-            f"{name}.{each}" for name in ("robot", "pose") for each in ("x", "y", "z", "qx", "qy", "qz", "qw", "time")
-        ).replace("robot.time", "robot.time, node.torso_height")
-        statement = f"""
-            SELECT node.start_time, node.end_time, node.status, node.reason, parent.start_time, {flat},
-                object.name, object.obj_type, op.x, op.y, op.z, op.qx, op.qy, op.qz, op.qw, op.time
-                {"," if columns else ""} {columns}
-            FROM task_tree_node AS node JOIN task_tree_node AS parent ON parent.id = node.parent_id
-            JOIN {table} AS leaf ON leaf.id = node.id
-            LEFT JOIN pose AS robot ON robot.id = node.robot_pose_id
-            LEFT JOIN pose ON pose.id = {f"leaf.{pose}" if pose else "NULL"}
-            LEFT JOIN object ON object.id = {f"leaf.{object_column}" if object_column else "NULL"}
-            LEFT JOIN pose AS op ON op.id = object.pose_id WHERE node.dtype = '{dtype}'"""
-        facts += [(dtype, *row) for row in ask(url, statement)]
-    return sorted(facts, key=lambda fact: fact[1])
-
-
-def test_the_baseline_holds_the_facts_of_the_tree(file: str, engine: Engine) -> None:
-    rollouts = tree_of([1, 5, 3, 1])
-    store(rollouts, engine)
-    assert stored_by_baseline(file) == expected(rollouts)
-
-
-def test_ours_holds_the_facts_of_the_tree(tmp_path: Path) -> None:
-    rollouts = tree_of([1, 5, 3, 1])
-    url = f"sqlite:///{tmp_path}/ours.db"
-    spool_tree(rollouts, tmp_path / "spool")
-    report = asyncio.run(recover(url, spool=tmp_path / "spool"))
-    assert (report.failed, report.lost, report.drained.stopped) == ({}, (), {})
-    assert stored_by_us(url) == expected(rollouts)

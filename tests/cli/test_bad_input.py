@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
+from tests.databases import Server
+from tests.store.test_postgresql_logins import WRITTEN, guarded_in
 
 pytestmark = pytest.mark.slow
 
@@ -180,19 +182,6 @@ def test_without_episodes_one_line_names_the_command_that_records_one(folder: Pa
     assert (done.returncode, done.stdout, done.stderr) == (0, "", f"no episode yet: {how}\n")
     done = pycrorm("episodes", "--status", "FAILED", "--url", "sqlite:///new.db", cwd=folder)
     assert (done.stdout, done.stderr) == ("", "no episode matches these options; `pycrorm episodes` lists all\n")
-
-
-def test_a_spool_of_another_database_is_refused_and_loses_nothing(folder: Path) -> None:
-    assert pycrorm("run", "plans.py", "--spool", "spool", cwd=folder).returncode == 0
-    assert pycrorm("run", "plans.py", "--spool", "spool", "--writer", "daemon", cwd=folder).returncode == 0
-    done = pycrorm("run", "plans.py", "--spool", "spool", "--url", "sqlite:///second.db", cwd=folder)
-    assert "belongs to log" in one_line_of(done)
-    assert done.returncode == 3
-
-
-def test_a_plan_that_ended_leaves_nothing_in_the_spool(folder: Path) -> None:
-    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
-    assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
 
 def test_the_settings_may_come_from_the_environment(folder: Path) -> None:
@@ -387,15 +376,6 @@ def without_rights(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
     return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_a_file_that_may_only_be_read_is_not_opened_for_recording(tmp_path: Path) -> None:
-    (tmp_path / "memory.db").touch(0o444)
-    opening = "from pycrorm_async.store.log import make_file; make_file(Path('memory.db'), 'memory.db', 'owner')"
-    command = [*bound(), sys.executable, "-c", f"from pathlib import Path; {opening}"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
-    reason = "this user may only read it: record with a user who may write it, or name another file"
-    assert done.stderr.endswith(f"DatabaseUnavailable: memory.db cannot be written: {reason}\n")
-
-
 @pytest.mark.soak  # the test before it opens the file only
 def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be_read(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
@@ -414,17 +394,6 @@ def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be
     assert done.returncode == 3
 
 
-def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:
-    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
-    with closing(sqlite3.connect(folder / "pycrorm.db")) as connection, connection:
-        connection.execute("UPDATE pycrorm_log SET format = 99")
-    connection.close()
-    for arguments in (["run", "plans.py"], ["episodes"]):
-        done = pycrorm(*arguments, cwd=folder)
-        assert "newer" in one_line_of(done)
-        assert done.returncode == 3
-
-
 # === unavailable server =======================================================================================
 #
 # A PostgreSQL that cannot be used is one line, exit code 3 or 2, and no password on the screen.
@@ -439,19 +408,53 @@ def test_an_unreachable_server_is_one_line_without_a_password(folder: Path, verb
     assert message == f"pycrorm: postgresql://ada:***@127.0.0.1:1/memory: {reached}"
 
 
+async def test_a_wrong_password_is_one_line_and_the_right_one_stores_the_waiting_events(
+    server: Server, folder: Path
+) -> None:
+    database = guarded_in(server)
+    wrong = server.url(database, user="guarded", password="s3cr-wrong")
+    right = server.url(database, user="guarded", password=WRITTEN)
+    assert pycrorm("run", "plans.py", "--writer", "daemon", "--spool", "spool", cwd=folder).returncode == 0
+    for verb in (["run", "plans.py"], ["writer"], ["writer", "--once"], ["episodes"]):
+        done = pycrorm(*verb, "--url", wrong, "--spool", "spool", cwd=folder)
+        message = one_line_of(done)
+        advice = "put the right password into PYCRORM_URL or ~/.pgpass"
+        assert message.endswith(f'password authentication failed for user "guarded": {advice}')
+        assert (done.returncode, done.stdout, "s3cr" in message) == (3, "", False)
+    assert answer("writer", "--once", "--url", right, "--spool", "spool", cwd=folder)["events_stored"] == 7
+
+
+# === unusable spool ===========================================================================================
+#
+# A spool whose disk is full or may only be read is one line and exit code 3.
+
+REFUSING = """
+import errno, os, sys
+place, fault = sys.argv.pop(1), getattr(errno, sys.argv.pop(1))
+def refusing(call):
+    def refused(path, *rest, **options):
+        where = os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.path.abspath(path)
+        if where.startswith(place):
+            raise OSError(fault, os.strerror(fault), where)
+        return call(path, *rest, **options)
+    return refused
+os.posix_fallocate = refusing(os.posix_fallocate)
+if fault == errno.EROFS:
+    os.mkdir = refusing(os.mkdir)
+from pycrorm_async.cli.main import main
+main()
+"""
+"""Run the command on a machine that can make no file below a place."""
+
+
 @pytest.mark.parametrize(
-    ("url", "reason"),
-    [
-        ("postgresql://ada:s3cr@127.0.0.1:99999/memory", "a port is a number from 1 to 65535"),
-        ("postgresql://ada:s3@cr@lab/memory", "an @ in a password is written %40"),
-        ("postgresql://ada@lab/memory?s3cr=1", "a PostgreSQL URL takes the parameters host, port"),
-        ("postgresql://ada:s3cr@lab", "a PostgreSQL URL names its database"),
-    ],
+    ("fault", "reason"), [("EROFS", "Read-only file system"), ("ENOSPC", "No space left on device")]
 )
-def test_an_invalid_url_is_one_line_without_a_password(tmp_path: Path, url: str, reason: str) -> None:
-    done = pycrorm("episodes", "--url", url, cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    message = one_line_of(done)
-    assert message.startswith(f"pycrorm: {reason}")
-    assert "s3" not in message
-    assert "cr@" not in message
+def test_a_spool_on_a_disk_that_takes_no_file_is_refused_in_one_line(folder: Path, fault: str, reason: str) -> None:
+    spool = folder / "disk" / "spool"
+    spool.parent.mkdir()
+    words = [sys.executable, "-c", REFUSING, str(spool), fault, "run", "plans.py", "--spool", str(spool)]
+    done = subprocess.run(words, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
+    assert one_line_of(done).startswith(f"pycrorm: spool {spool}")
+    assert reason in one_line_of(done)
+    assert (done.returncode, done.stdout) == (3, "")

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import sqlite3
 import subprocess
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.databases import ask, ask_to_change
 
 pytestmark = pytest.mark.soak
 """Each of these tests starts many processes."""
@@ -74,15 +73,8 @@ def lab(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def ask(folder: Path, question: str) -> list[Any]:
-    with closing(sqlite3.connect(folder / "pycrorm.db")) as connection, connection:
-        result = connection.execute(question).fetchall()
-    connection.close()
-    return result
-
-
 def weighed(folder: Path) -> list[Any]:
-    return ask(folder, "SELECT what, grams, status FROM weighing ORDER BY id")
+    return ask(folder / "pycrorm.db", "SELECT what, grams, status FROM weighing ORDER BY id")
 
 
 def write_entry_points(folder: Path, **entries: str) -> None:
@@ -114,7 +106,7 @@ def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path)
     }  # fmt: skip
     assert weighed(lab) == WEIGHED
     assert answer("verify", "--projection", "lab:Weighed", cwd=lab)["drift"] == 0
-    ask(lab, "UPDATE zz_pycrorm_own_weighing__1002 SET grams = 3 WHERE what = 'milk'")
+    ask_to_change(lab / "pycrorm.db", "UPDATE zz_pycrorm_own_weighing__1002 SET grams = 3 WHERE what = 'milk'")
     result = answer("verify", "--projection", "lab:Weighed", cwd=lab, code=1)
     assert [(each["table"], each["column"], each["stored"]) for each in result["differences"]] == [
         ("weighing", "grams", 3)
@@ -125,13 +117,6 @@ def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path)
         "generation 1002",
         "weighed, generation 1003",
     ]
-    assert weighed(lab) == WEIGHED
-
-
-def test_a_writer_with_the_projection_catches_up(lab: Path) -> None:
-    pycrorm("run", "weighing.py", cwd=lab)
-    done = pycrorm("writer", "--once", "--projection", "lab:Weighed", cwd=lab)
-    assert (done.returncode, done.stderr) == (0, "")
     assert weighed(lab) == WEIGHED
 
 

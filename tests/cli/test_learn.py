@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 import signal
-import sqlite3
 import subprocess
 from collections import Counter
 from dataclasses import replace
@@ -162,30 +160,6 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
         "ceiling in 75.0% of the held-out scenes some way succeeds",
         "kitchen not picked up in 3 attempts: out of reach",
     ]
-
-
-@pytest.mark.soak  # test_run sends the second signal to a script
-def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) -> None:
-    command = [*COMMAND, *BY_ONE, "--rollouts", "100000", "--json"]
-    process = subprocess.Popen(
-        command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stderr is not None
-    await_events(tmp_path / "pycrorm.db", 500)
-    # Another process locks the database, so that nothing can be stored: the second Ctrl-C comes before the lock ends.
-    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)) as other:
-        other.execute("BEGIN IMMEDIATE")
-        process.send_signal(signal.SIGINT)
-        note = process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        printed, message = process.communicate(timeout=120)
-    assert note == "recorded events are being stored; Ctrl-C again exits at once without losing any\n"
-    assert (process.returncode, printed) == (130, "")
-    assert (
-        message == "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
-    )
-    phase = answer(*BY_ONE, "--resume", cwd=tmp_path)["phases"][0]
-    assert (phase["rollouts"], phase["done_now"] < 400) == (400, True)
 
 
 # the options of the database and of files are those of other verbs

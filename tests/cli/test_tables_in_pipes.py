@@ -122,14 +122,11 @@ def test_an_export_of_csv_has_no_formulas_on_request_and_is_made_again_alike(fol
         (["--status", "SUCCEEDED", "--without-tag", "good", "--without-tag", "noisy"], [4, 5]),
     ],
 )
-@pytest.mark.parametrize(
-    "name", [[], *(pytest.param(each, marks=pytest.mark.soak) for each in (["step_action"], ["durations"]))]
-)
 def test_an_export_has_the_episodes_with_and_without_tags(
-    options: list[str], numbers: list[int], name: list[str], folder: Path, tmp_path: Path
+    options: list[str], numbers: list[int], folder: Path, tmp_path: Path
 ) -> None:
     url = f"sqlite:///{folder / 'pycrorm.db'}"
-    done = answer("export", *name, *options, "--out", tmp_path / "chosen.jsonl", "--url", url, cwd=tmp_path)
+    done = answer("export", *options, "--out", tmp_path / "chosen.jsonl", "--url", url, cwd=tmp_path)
     assert done["episodes"] == len(numbers)
     manifest = json.loads((tmp_path / "chosen.jsonl.manifest.json").read_text())
     assert [each["number"] for each in manifest["episodes"]] == numbers
@@ -171,12 +168,6 @@ def test_a_column_that_the_view_of_all_nodes_has_is_named_with_the_join(folder: 
     assert "task_tree_node" not in pycrorm("query", "SELECT nothing FROM step_action", cwd=folder).stderr
     joined = answer("query", "SELECT DISTINCT status FROM step_action JOIN task_tree_node USING (id)", cwd=folder)
     assert [row["status"] for row in joined["rows"]] == ["SUCCEEDED", "FAILED"]
-
-
-def test_the_package_lists_its_public_names() -> None:
-    import pycrorm_async
-
-    assert set(pycrorm_async.__all__) <= set(dir(pycrorm_async))
 
 
 def test_a_pipe_gets_no_colour_and_no_bar_where_notebooks_and_services_set_force_color(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
-import tarfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -229,8 +228,6 @@ def test_an_earlier_refusal_is_a_problem_even_while_its_recorder_is_alive(tmp_pa
 #
 # `pycrorm status` names the running episodes and their robots.
 
-MEMORY_OF_0_1_0 = Path(__file__).parents[1] / "golden" / "memory_v1.tar.gz"
-
 
 @pytest.mark.soak_on("postgresql")
 async def test_a_running_episode_is_named_with_its_robots_until_it_ends(database_url: str, tmp_path: Path) -> None:
@@ -282,10 +279,3 @@ async def test_of_many_running_episodes_the_newest_are_listed(tmp_path: Path) ->
     assert document["running_total"] == count
     assert [each["number"] for each in document["running"]] == list(range(count, 2, -1))
     assert f"The {RUNNING_MAX} newest of {count} running episodes" in shown.stdout
-
-
-def test_a_memory_whose_tables_are_those_of_another_version_has_a_status(tmp_path: Path) -> None:
-    with tarfile.open(MEMORY_OF_0_1_0) as archive:
-        archive.extractall(tmp_path, filter="data")
-    document = answer("status", "--url", f"sqlite:///{tmp_path}/memory.db", cwd=tmp_path)
-    assert (document["database"], document["running"], document["running_total"]) == ("ok", [], 0)

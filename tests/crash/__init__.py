@@ -21,7 +21,7 @@ follow from a seed that is printed, and that PYCRORM_TEST_SEED sets.
  7b each system call of queue, writer and SQLite fails once
         test_failing_calls
  8  a full disk, below the queue and below the database
-        test_disk, test_real_disks (ext4 and XFS), store/test_full_disk, cli/test_bad_spool
+        test_disk, test_real_disks (ext4 and XFS), store/test_full_disk, cli/test_bad_input
  9  a COMMIT whose reply is lost
         store/test_postgresql_faults, writer/test_drain, writer/test_writer_thread
 10  a database stopped or killed under load, a failover, a network that cuts, stalls, resets, dribbles

@@ -276,6 +276,7 @@ def test_an_import_that_is_killed_and_started_again_doubles_nothing_and_misses_n
         (["mcap", "t.json", "--map", "rate.toml"], "Expected `float` >= 1e-06 - at `$.rate_hz`"),
         (["trace", "."], "is a folder: name the trace files in it"),
         (["trace", "words.txt"], "words.txt is no trace in JSON"),
+        (["trace", "cut.json.gz"], "cut.json.gz cannot be decompressed: "),
         (["trace", "other.json"], "is no whole trace in JSON: it has neither traceEvents nor resourceSpans"),
         (["trace", "t.json", "--map", "none.toml"], "the map file none.toml cannot be read: No such file or directory"),
         (["trace", "t.json", "--map", "wrong.toml"], "unknown field `strat`; keys of this format: name, description"),
@@ -285,6 +286,7 @@ def test_an_import_that_is_killed_and_started_again_doubles_nothing_and_misses_n
 def test_a_wrong_call_or_file_is_one_line_and_leaves_nothing(tmp_path: Path, words: list[str], line: str) -> None:
     (tmp_path / "t.json").write_text(trace_of({"ph": "X", "name": "Drive", "ts": 0, "dur": 5}))
     (tmp_path / "words.txt").write_text("no trace at all")
+    (tmp_path / "cut.json.gz").write_bytes(gzip.compress(b"[]")[:-5])
     (tmp_path / "other.json").write_text('{"a": [1]}')
     (tmp_path / "wrong.toml").write_text("strat = 3")
     (tmp_path / "late.toml").write_text("start = 2300-01-01T00:00:00Z")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from langgraph.prebuilt import ToolNode
 from langgraph.types import interrupt
 
 from pycrorm_async import Memory, Settings
-from pycrorm_async.integrations import callbacks
 from pycrorm_async.integrations.callbacks import RememberedRuns
 from pycrorm_async.plan.failures import NavigationGoalNotReached
 from pycrorm_async.record.recording import Recording
@@ -305,11 +303,3 @@ def test_a_handler_used_after_its_block_and_after_its_memory_disturbs_no_run(tmp
         assert memory.status.faults.total == 1
     assert step.invoke(3, {"callbacks": [runs]}) == 3
     assert len(nodes(tmp_path)) == 1
-
-
-def test_the_example_of_the_readme_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = Path(callbacks.__file__).with_name("README.md").read_text()
-    [example] = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "RememberedRuns" in each]
-    monkeypatch.chdir(tmp_path)
-    exec(example, {})
-    assert ask(tmp_path / "agent.db", "SELECT object_name FROM pick_up") == [("milk",)]

@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import re
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
@@ -21,8 +19,6 @@ from py_trees.blackboard import Blackboard
 from py_trees.common import Status
 
 from pycrorm_async import Memory, Settings, recover
-from pycrorm_async.errors import CallerError
-from pycrorm_async.integrations import py_trees as integration
 from pycrorm_async.integrations.py_trees import RememberedTree
 from pycrorm_async.record import executives
 from tests.commands import environment
@@ -200,15 +196,6 @@ def test_changes_of_the_blackboard_are_observations_of_the_behaviour_that_writes
         ("blackboard/goal", None, "value", None),
         ("repeated", "measure", "ticks", 100),
     ]
-
-
-def test_the_example_of_the_readme_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = Path(integration.__file__).with_name("README.md").read_text()
-    [example] = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "RememberedTree" in each]
-    monkeypatch.chdir(tmp_path)
-    exec(example, {})
-    rows = ask(tmp_path / "trees.db", "SELECT dtype, status FROM designator ORDER BY id")
-    assert rows[0] == ("TickCounter", "SUCCEEDED")
 
 
 # === remembered trees =========================================================================================
@@ -395,12 +382,6 @@ def test_other_visitors_and_handlers_of_the_tree_stay(tmp_path: Path) -> None:
     assert ticked.visitors == [other]
 
 
-def test_an_unknown_version_of_py_trees_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(integration, "__version__", "3.0.0")
-    with Memory.sync(url_of(tmp_path)) as memory, pytest.raises(CallerError, match=r"py_trees 3\.0\.0 is unknown"):
-        RememberedTree(tree(Scripted("look", named("S"))), memory.recording)
-
-
 _KILLED = """
 import os, signal, sys
 from pycrorm_async import Memory
@@ -500,22 +481,12 @@ def misplaced(folder: Path) -> list[Any]:
 
 
 @pytest.mark.parametrize("instant_s", [0.0, 60.0])
-@pytest.mark.soak_on(3, 4, 5)
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_random_tree_is_remembered_as_it_was_visited(
     seed: int, instant_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executives, "_UNWRITTEN_TICKS", 5 + seed)
     _compare(random.Random(seed), instant_s, tmp_path)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("seed", range(100, 110))
-def test_many_random_trees_are_remembered_as_they_were_visited(seed: int, in_turn: bool) -> None:
-    chance = random.Random(seed)
-    for _ in range(3 if in_turn else 30):
-        with tempfile.TemporaryDirectory() as folder:
-            _compare(chance, chance.choice([0.0, 60.0]), Path(folder))
 
 
 def _compare(chance: random.Random, instant_s: float, folder: Path) -> None:

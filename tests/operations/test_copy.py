@@ -7,13 +7,13 @@ import hashlib
 import itertools
 import random
 import shutil
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import NodeStarted
@@ -34,7 +34,6 @@ from tests.operations.memories import (
     assert_same,
     declarations_as_records,
     everything,
-    lost,
     notes,
     random_plans,
 )
@@ -124,17 +123,6 @@ async def test_an_episode_that_is_longer_in_the_target_is_not_changed(new_file: 
     assert_same(target, source)
 
 
-@pytest.mark.soak_on("postgresql")
-async def test_a_computed_end_is_copied_like_any_event(new_url: New, new_file: New) -> None:
-    source, target = new_file(), new_url()
-    await fill(source, [hand_written(2), lost(1)])
-    await copy_episodes(source, target)
-    await copy_episodes(source, target)
-    assert_same(source, target)
-    assert ask(target, "SELECT status FROM process_metadata ORDER BY id") == [("SUCCEEDED",), ("LOST",)]
-    assert set(ask(target, "SELECT status FROM task_tree_node")) == {("SUCCEEDED",), ("LOST",)}
-
-
 # --- two sources ------------------------------------------------------------------------------------------------------
 
 
@@ -167,7 +155,9 @@ async def test_a_copy_repeats_each_step_in_which_another_process_hinders_it(
 
 @pytest.mark.soak_on("postgresql")
 @pytest.mark.soak
-async def test_two_memories_merge_into_the_same_one_in_any_order_and_concurrently(new_url: New, new_file: New) -> None:
+async def test_two_memories_merge_into_the_same_one_in_any_order_and_at_once_and_are_rebuilt(
+    new_url: New, new_file: New
+) -> None:
     one, other = new_file(), new_file()
     await random_plans(one, range(20, 30))
     await random_plans(other, range(25, 35))
@@ -181,6 +171,14 @@ async def test_two_memories_merge_into_the_same_one_in_any_order_and_concurrentl
     await asyncio.gather(*(copy_episodes(each, at_once, settings=SMALL) for each in (one, other, one)))
     for target in (first, second, at_once):
         assert_merged(target, one, other)
+    at = "memory_tables." if first.startswith("postgresql:") else ""
+    ask_to_change(
+        first, f"UPDATE {at}zz_task_tree_node__1001 SET status = 'RUNNING'"
+    )  # the rebuild reads the log alone
+    done = await rebuild_memory(first)
+    assert (done.generation, done.parked, done.left) == (1002, {}, [])
+    assert_merged(first, one, other)
+    assert traces(first) == []
 
 
 # --- concurrent recorders ---------------------------------------------------------------------------------------------
@@ -204,49 +202,6 @@ async def test_a_running_episode_is_copied_as_far_as_it_is_and_later_completed(n
     assert copies == 3
     await copy_episodes(source, target)
     assert_same(source, target)
-
-
-@pytest.mark.soak_on("postgresql")
-@pytest.mark.soak
-async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
-    new_url: New, new_file: New, tmp_path: Path
-) -> None:
-    source, target, separate = new_file(), new_url(), new_file()
-    await notes(separate, *map(str, range(200)))
-    await notes(source, "before")
-
-    async def record(url: str, name: str) -> None:
-        opened = Memory.open(url, spool=tmp_path / f"{name}.spool", settings=PATIENT)
-        async with opened as memory, memory.episode(description=name):
-            for index in range(150):
-                await NoteActionPerformable(f"{name} {index}").perform()
-                await asyncio.sleep(0.002)
-                assert memory.status.faults.total == 0
-
-    async def copy(url: str) -> None:
-        while recording:
-            await copy_episodes(url, target, settings=SMALL)
-            await asyncio.sleep(0.01)
-
-    recording = True
-    async with asyncio.TaskGroup() as group:
-        copies = [group.create_task(copy(each)) for each in (source, separate)]
-        await asyncio.gather(record(source, "here"), record(target, "there"))
-        recording = False
-        await asyncio.wait(copies)
-    await copy_episodes(source, target)
-    copied_logs = logs_of(target)
-    expected = logs_of(source) | logs_of(separate)
-    assert {episode: copied_logs[episode] for episode in expected} == expected
-    assert len(copied_logs) == 4
-    async with Reading.open(target) as reading:
-        assert sorted(await texts(reading)) == sorted(
-            [
-                "before",
-                *map(str, range(200)),
-                *(f"{name} {index}" for name in ("here", "there") for index in range(150)),
-            ]
-        )
 
 
 # --- killed -----------------------------------------------------------------------------------------------------------
@@ -300,33 +255,12 @@ async def test_events_appended_but_not_folded_before_a_kill_are_folded_by_the_ne
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_a_memory_is_not_copied_into_itself(new_url: New, tmp_path: Path) -> None:
-    url = new_url()
-    await notes(url, "a")
-    before = logs_of(url)
-    with pytest.raises(CallerError, match="are the same memory"):
-        await copy_episodes(url, url)
-    assert logs_of(url) == before
-
-
-@pytest.mark.soak_on("postgresql")
 async def test_a_copy_of_the_files_of_a_memory_is_recognised_as_the_same_memory(new_file: New) -> None:
     source, target = new_file(), new_file()
     await notes(source, "a")
     shutil.copy(path_of(source), path_of(target))
     with pytest.raises(CallerError, match=r"or file copies of one memory: copy to a new URL"):
         await copy_episodes(source, target)
-
-
-@pytest.mark.soak_on("postgresql")
-async def test_an_impossible_copy_makes_no_target(new_file: New) -> None:
-    source, target = new_file(), new_file()
-    with pytest.raises(DatabaseUnavailable, match="does not exist"):
-        await copy_episodes(source, target)
-    await notes(source, "a")
-    with pytest.raises(UnknownEpisode, match="there is no episode '7'"):
-        await copy_episodes(source, target, episodes=["1", "7"])
-    assert not path_of(target).exists()
 
 
 @pytest.mark.soak_on("postgresql")
@@ -425,7 +359,7 @@ async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_othe
 
 
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("sequence", [1, 7, 12])
+@pytest.mark.parametrize("sequence", [1, 7])
 async def test_of_an_episode_with_a_gap_the_events_before_it_are_copied(new_file: New, sequence: int) -> None:
     source, target = new_file(), new_file()
     await fill(source, [hand_written(number) for number in (1, 2)])
@@ -442,8 +376,7 @@ async def test_of_an_episode_with_a_gap_the_events_before_it_are_copied(new_file
 
 
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("damaged", [0, 1])
-@pytest.mark.parametrize("sequence", [1, 7, 12])
+@pytest.mark.parametrize(("sequence", "damaged"), [(1, 0), (12, 1)])
 async def test_a_gap_in_both_memories_is_reported(new_file: New, sequence: int, damaged: int) -> None:
     source, target = both = new_file(), new_file()
     for url in both:
@@ -456,7 +389,7 @@ async def test_a_gap_in_both_memories_is_reported(new_file: New, sequence: int, 
 
 
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("payload", ["", "{", '{"node":"four"}', "[1]", '{"node":4,"status":"SUCCEEDED"} x'])
+@pytest.mark.parametrize("payload", ["{", '{"node":"four"}'])
 async def test_of_an_episode_with_an_unreadable_event_the_events_before_it_are_copied(
     new_file: New, payload: str
 ) -> None:
@@ -498,44 +431,3 @@ async def test_an_episode_whose_type_contradicts_the_target_is_copied_and_folded
     assert logs_of(target)[done.id] == logs_of(source)[done.id]
     rows = ask(target, "SELECT text, text_integer FROM note_action ORDER BY id")
     assert rows == [("a text", None), (None, 5)]
-
-
-# === merged and rebuilt =======================================================================================
-#
-# Two memories in one, with tables rebuilt from its log: the content of both, under keys that no database assigned.
-
-NewUrl = Callable[[], str]
-
-
-async def merged(
-    new_file: NewUrl, new_url: NewUrl, fill_other: Callable[[str], Awaitable[None]]
-) -> tuple[str, str, str]:
-    """Two sources that share episodes under numbers of their own, and a third memory with the content of both."""
-    one, recorded, other, target = new_file(), new_file(), new_url(), new_url()
-    await random_plans(one, range(20, 26))
-    await fill(one, [hand_written(1), lost(2)])
-    await fill_other(recorded)
-    await copy_episodes(recorded, other)
-    await copy_episodes(one, other, episodes=["2", "4"])
-    for source in (other, one):  # not in the order of their numbers
-        await copy_episodes(source, target)
-    numbers = [dict(ask(each, "SELECT id, number FROM episode")) for each in (one, target)]
-    assert all(numbers[0][each] != numbers[1][each] for each in numbers[0])
-    statuses = {row["status"] for row in tables_of(target)["task_tree_node"].values()}
-    assert statuses >= {"SUCCEEDED", "FAILED", "LOST"}, "the random plans fail in no way, so this proves little"
-    return one, other, target
-
-
-@pytest.mark.soak_on("postgresql")
-async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_hold(
-    new_url: NewUrl, new_file: NewUrl
-) -> None:
-    one, other, target = await merged(new_file, new_url, everything)
-    assert_merged(target, one, other)
-    at = "memory_tables." if target.startswith("postgresql:") else ""
-    for change in ("DELETE FROM {}zz_pose__1001", "UPDATE {}zz_task_tree_node__1001 SET status = 'RUNNING'"):
-        ask_to_change(target, change.format(at))  # the comparison below does not use the merged tables
-    done = await rebuild_memory(target)
-    assert (done.generation, done.parked, done.left) == (1002, {}, [])
-    assert_merged(target, one, other)
-    assert traces(target) == []

@@ -10,31 +10,26 @@ from typing import Any, NamedTuple
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import Action, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import Action, TaskTreeNode
 from pycrorm_async.plan import (
     ActionAbstract,
     BelieveObject,
-    CostmapLocation,
     DetectAction,
     DetectActionPerformable,
     MoveTorsoAction,
     NavigateAction,
     NavigateActionPerformable,
     ObjectDesignatorDescription,
-    ObjectPart,
-    OpenActionPerformable,
     ParkArmsAction,
     PickUpAction,
-    PickUpActionPerformable,
     PlanFailure,
     PlanFailures,
 )
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import Lab, lab, nodes_of, recorded, results_of, statuses, url_of, written
+from tests.promises.lab import Lab, lab, nodes_of, recorded, results_of, statuses
 
 pytestmark = pytest.mark.slow
 
@@ -116,19 +111,6 @@ CASES = {
         ["MILK", {"milk": "is outside the camera's field of view"}],
         ("DetectAction", "DetectingMotion"),
     ),
-    "a pose no place reaches": Case(
-        lambda scene: located(CostmapLocation(Pose([9, 9, 9], time_ns=1), reachable_for=scene.robot)),
-        "ReachabilityFailure",
-        f"there is no place to stand and reach {Pose([9, 9, 9])}",
-        [written(Pose([9, 9, 9], time_ns=1))],
-    ),
-    "to open what is no part of anything": Case(
-        lambda scene: OpenActionPerformable(ObjectPart("milk", scene.milk), Arms.LEFT).perform(),
-        "EnvironmentManipulationImpossible",
-        "no joint of milk moves milk",
-        ["milk", "milk"],
-        ("OpenAction",),
-    ),
 }
 
 
@@ -149,31 +131,6 @@ async def test_an_impossible_action_is_recorded_and_the_plan_continues(tmp_path:
     assert statuses(nodes[-1:]) == [("NoteAction", "SUCCEEDED")]
     assert nodes[-1].parent is not None
     assert nodes[-1].parent.id == serving.id
-
-
-async def test_an_uncaught_failure_is_recorded_up_to_the_episode(tmp_path: Path) -> None:
-    with pytest.raises(PlanFailure):
-        async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
-            with lab() as scene:
-                scene.milk.remove()
-                attempt = AttemptActionPerformable(PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.TOP).perform)
-                await AttemptActionPerformable(attempt.perform).perform()
-    nodes = await nodes_of(tmp_path)
-    assert statuses(nodes) == [
-        (None, "FAILED"),
-        ("AttemptAction", "FAILED"),
-        ("AttemptAction", "FAILED"),
-        ("PickUpAction", "FAILED"),
-    ]
-    for node in nodes:
-        assert (node.reason, node.failure_message) == (
-            "PerceptionObjectNotInWorld",
-            "milk is not an object of the world",
-        )
-        assert node.failure_arguments == ["milk is not an object of the world", "milk"]
-    (episode,) = await results_of(tmp_path, select(ProcessMetaData))
-    assert (episode.status, episode.failure_message) == ("FAILED", "milk is not an object of the world")
-    assert episode.failure_type == "pycrorm_async.plan.failures.PerceptionObjectNotInWorld"
 
 
 async def test_a_plan_without_world_or_robot_fails_with_the_next_step_and_is_recorded(tmp_path: Path) -> None:

@@ -25,13 +25,12 @@ from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections import fold
-from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import Arms
-from tests.databases import ask, ask_to_change
+from tests.databases import ask
 from tests.golden.unpacking import unpack_memory_v1
 from tests.store.factories import declaration, episode, run_of
 from tests.table_comparison import differences, tables_of
@@ -188,18 +187,6 @@ async def test_a_memory_of_the_first_version_has_all_its_rows_and_its_spool_is_a
     assert (verified.episodes, verified.events, verified.damages, verified.differences) == (3, 28, [], [])
 
 
-async def test_a_log_of_the_first_version_has_the_tables_of_a_new_one(golden: str, tmp_path: Path) -> None:
-    new = f"sqlite:///{tmp_path}/new.db"
-    for url in (golden, new):
-        await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
-    of_the_log = (
-        "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE tbl_name IN"
-        " ('pycrorm_log', 'pycrorm_declaration', 'episode', 'event') ORDER BY type, name"
-    )
-    assert ask(golden, of_the_log) == ask(new, of_the_log)
-    assert len(ask(new, of_the_log)) == 17
-
-
 async def test_a_newer_program_migrates_an_open_log_and_older_programs_cannot_open_it_again(
     database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -338,13 +325,3 @@ async def test_an_upcaster_serves_fold_rebuild_and_snapshots_of_older_events(
     log = await EventLog.open(DatabaseAddress.parse(golden), create=False)
     assert msgspec.json.decode((await log.events(1))[1].payload)["name"] == "milk"  # the log is unchanged
     await log.close()
-
-
-# --- another version of the fold --------------------------------------------------------------------------------------
-
-
-async def test_tables_of_a_newer_fold_are_refused(golden: str) -> None:
-    ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION + 1}")
-    for call in (performed(golden, greeting(whom=str)("Eve")), designators_of(golden, "GreetAction")):
-        with pytest.raises(DatabaseForeign, match=r"use a newer pycrorm$"):
-            await call

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
@@ -22,7 +21,6 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.recall.answer import Relation
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.overview import overview_document
-from tests.commands import pycrorm
 from tests.databases import ask
 
 NOW_NS = 1_800_000_000_000_000_000
@@ -199,18 +197,6 @@ async def test_remembered_actions_have_the_order_of_the_monotonic_clock(tmp_path
             return related
 
         assert_alike(await each_episode(relations))
-
-
-async def test_the_terminal_prints_the_durations_of_the_monotonic_clock(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/memory.db"
-    await record(url, tmp_path / "spool")
-    shown = {
-        number: re.sub(r"\d{4}-\d\d-\d\d .{8}|[0-9a-f]{8}-[0-9a-f-]{27}|Episode \d", "", text_)
-        for number in range(1, len(STEPS) + 1)
-        if (text_ := pycrorm("show", str(number), "--events", "--url", url, cwd=tmp_path).stdout)
-    }
-    assert_alike(shown)
-    assert pycrorm("episodes", "--url", url, cwd=tmp_path).stdout.count(" 15.75 s ") == len(STEPS)
 
 
 async def test_no_time_passes_on_the_clock_of_an_episode_until_it_is_tagged(tmp_path: Path) -> None:

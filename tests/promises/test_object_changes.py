@@ -245,13 +245,11 @@ class RandomChanger:
             self.world.restore_state(self.state)
 
 
-@pytest.mark.soak_on(1, 2)
-@pytest.mark.parametrize("seed", range(3))
-async def test_every_operation_on_a_world_is_recorded(tmp_path: Path, seed: int) -> None:
+async def test_every_operation_on_a_world_is_recorded(tmp_path: Path) -> None:
     async with recorded(tmp_path):
         chronicle = Chronicle()
         with lab(chronicle) as scene:
-            meddler = RandomChanger(scene, seed)
+            meddler = RandomChanger(scene, 0)
             for index in range(300):
                 if index % 3:
                     await RearrangingActionPerformable(meddler.change).perform()

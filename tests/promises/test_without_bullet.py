@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.commands import environment, one_line_of
+from tests.commands import environment
 
 pytestmark = pytest.mark.slow
 
@@ -150,17 +150,6 @@ def test_a_verb_that_needs_a_world_first_names_what_to_install(refused: Any) -> 
     code, printed, files = refused[0]
     assert (code, printed.count("\n"), files) == (2, 1, ["sweep.py"])
     assert printed.startswith(f"pycrorm: {LINE}")
-
-
-@pytest.mark.every_python
-@pytest.mark.soak
-def test_learn_first_names_what_to_install(tmp_path: Path) -> None:
-    pytest.importorskip("jpt", reason="learn names the first missing package")
-    words = ["pycrorm", "learn", "--rollouts", "30"]
-    done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
-    assert done.returncode == 2
-    assert one_line_of(done).startswith(f"pycrorm: {LINE}")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.every_python

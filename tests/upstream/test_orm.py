@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 import sqlite3
 from contextlib import closing
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -16,14 +15,13 @@ from sqlalchemy import func, select
 from pycrorm_async import Memory, orm, plan
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
+from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.commands import pycrorm
 from tests.databases import Server, ask
 from tests.plan.conftest import kitchen
 from tests.promises.lab import at, url_of
-from tests.table_comparison import Tables, differences, logs_of, tables_of, united
-from tests.upstream.conftest import DESCRIPTION, Recorded, common_plan
+from tests.table_comparison import Tables, differences, tables_of, united
+from tests.upstream.conftest import Recorded, common_plan
 
 pytestmark = pytest.mark.slow
 
@@ -71,12 +69,6 @@ async def test_node(planned: Recorded) -> None:
     }
 
 
-async def test_metadata_existence(planned: Recorded) -> None:
-    poses = await planned.all(select(orm.Pose))
-    assert poses
-    assert {each.process_metadata.description for each in poses} == {DESCRIPTION}
-
-
 async def test_task_tree_node_parents(planned: Recorded) -> None:
     nodes = {each.id: each for each in await planned.all(select(orm.TaskTreeNode))}
     roots = [each for each in nodes.values() if each.parent is None]
@@ -98,22 +90,11 @@ async def test_task_tree_node_parents(planned: Recorded) -> None:
 async def test_meta_data(planned: Recorded) -> None:
     metadata = await planned.one(select(orm.ProcessMetaData))
     assert metadata.status == "SUCCEEDED"
-    for mapped in (orm.Action, orm.Motion, orm.Object, orm.RobotState, orm.TaskTreeNode):
+    for mapped in (orm.Action, orm.Motion, orm.Object, orm.Pose, orm.RobotState, orm.TaskTreeNode):
         rows = await planned.all(select(mapped))
         assert rows
         assert {each.process_metadata_id for each in rows} == {metadata.id}
     assert await planned.all(select(orm.ParkArmsAction)) == []
-
-
-async def test_meta_data_alternation(tmp_path: Path) -> None:
-    """The given description is stored, and belongs to that episode alone."""
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with kitchen():
-            for description in ("meta_data_alternation_test", "and another"):
-                async with memory.episode(description=description):
-                    await plan.ParkArmsActionPerformable(Arms.LEFT).perform()
-    parked = await Recorded(tmp_path).all(select(orm.ParkArmsAction).order_by(orm.ParkArmsAction.id))
-    assert [each.process_metadata.description for each in parked] == ["meta_data_alternation_test", "and another"]
 
 
 async def test_pose(planned: Recorded) -> None:
@@ -134,33 +115,6 @@ async def test_pose_mixin(planned: Recorded) -> None:
         *[((0.6, 0.4, 0), 0.0)] * 2,  # and so does the torso
         *[((0.6, 0.4, 0), 0.3)] * 10,
     ]
-
-
-async def test_plan_serialization(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
-        with kitchen(), plan.collected_tree() as tree:
-            await common_plan()
-    recorded = Recorded(tmp_path)
-    performed = len(await recorded.all(select(orm.Action))) + len(await recorded.all(select(orm.Motion)))
-    assert len(tree) == performed == 14
-
-
-async def test_code_designator_type(planned: Recorded) -> None:
-    first, second, *_ = await planned.all(
-        select(orm.TaskTreeNode).where(orm.TaskTreeNode.action_id.is_not(None)).order_by(orm.TaskTreeNode.start_ns)
-    )
-    assert [each.action.dtype for each in (first, second)] == ["NavigateAction", "MoveMotion"]
-    assert first.start_time <= datetime.now(UTC)
-    assert (datetime.now(UTC) - first.start_time) < timedelta(minutes=10)
-    assert second.status is TaskStatus.SUCCEEDED
-
-
-async def test_parkArmsAction(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
-        with kitchen():
-            await plan.ParkArmsActionPerformable(Arms.BOTH).perform()
-    park = await Recorded(tmp_path).one(select(orm.ParkArmsAction))
-    assert (park.dtype, park.arm) == ("ParkArmsAction", Arms.BOTH)
 
 
 async def test_transportAction(tmp_path: Path) -> None:
@@ -191,14 +145,6 @@ async def test_lookAt_and_detectAction(tmp_path: Path) -> None:
     assert at((await recorded.one(select(orm.LookAtAction))).pose) == (1.3, 1, 0.9)
     detect = await recorded.one(select(orm.DetectAction))
     assert (detect.object.name, detect.object.obj_type) == ("milk", ObjectType.MILK)
-
-
-async def test_setGripperAction(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
-        with kitchen():
-            await plan.SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
-    gripper = await Recorded(tmp_path).one(select(orm.SetGripperAction))
-    assert (gripper.gripper, gripper.motion) == (Arms.LEFT, GripperState.OPEN)
 
 
 async def test_open_and_closeAction(tmp_path: Path) -> None:
@@ -296,12 +242,3 @@ async def test_merge_databases(source: str, destination: str) -> None:
     described = ask(destination, "SELECT description FROM process_metadata ORDER BY description")
     assert described == [("run 0",), ("run 1",), ("run 2",), ("was here before",)]
     assert tables_of(source) == rows
-
-
-async def test_migrate_neems(source: str, destination: str, tmp_path: Path) -> None:
-    rows, before, log = tables_of(source), tables_of(destination), logs_of(destination)
-    for _ in range(2):
-        done = pycrorm("copy", "--from", source, "--to", destination, cwd=tmp_path)
-        assert (done.returncode, done.stderr) == (0, "")
-        assert_holds(destination, rows, before)
-    assert logs_of(destination) == log | logs_of(source)

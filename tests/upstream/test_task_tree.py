@@ -1,4 +1,4 @@
-"""PyCRAM's tests of its task tree and of attachments (July 2024), by name."""
+"""PyCRAM's tests of its task tree (July 2024), by name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure, SimulatedTaskTree, TaskStatus, collected_tree
 from pycrorm_async.plan.task import CollectedTree
 from pycrorm_async.world import Pose
-from pycrorm_async.world.world_copy import copied, counterpart
 from tests.plan.conftest import Scene, kitchen
 from tests.promises.lab import url_of
 from tests.upstream.conftest import Recorded, common_plan
@@ -103,50 +102,3 @@ async def test_to_sql(tmp_path: Path) -> None:
         assert node.started_ns <= row.start_ns <= row.end_ns
         assert node.ended_ns <= row.end_ns
         assert type(row.action).__name__ == row.dtype
-
-
-# === attachment ===============================================================================================
-#
-# PyCRAM's tests of attachments (July 2024), by name. A child refers to its parent here, without inverse attachment.
-
-
-def test_attach(scene: Scene) -> None:
-    scene.milk.attach(scene.cereal)
-    assert scene.milk.attachments == {scene.cereal: None}
-    assert scene.cereal.attached_to is scene.milk
-
-
-def test_detach(scene: Scene) -> None:
-    scene.milk.attach(scene.cereal)
-    scene.milk.detach(scene.cereal)
-    assert scene.milk.attachments == {}
-    assert scene.cereal.attached_to is None
-
-
-def test_attachment_behavior(scene: Scene) -> None:
-    scene.robot.attach(scene.milk)
-    before = scene.milk.pose
-    scene.robot.set_pose(Pose([1, 0, 0]))
-    # the robot was at the origin
-    assert scene.milk.pose.position == (before.position.x + 1, before.position.y, before.position.z)
-
-
-def test_detachment_behavior(scene: Scene) -> None:
-    scene.robot.attach(scene.milk)
-    before = scene.milk.pose
-    scene.robot.detach(scene.milk)
-    scene.robot.set_pose(Pose([1, 0, 0]))
-    assert scene.milk.pose == before
-
-
-def test_prospection_object_attachments_not_changed_with_real_object(scene: Scene) -> None:
-    with copied(scene.world) as copy:
-        milk, cereal = counterpart(scene.milk, copy), counterpart(scene.cereal, copy)
-        assert milk is not None
-        assert cereal is not None
-        scene.milk.attach(scene.cereal)
-        assert (milk.attachments, cereal.attached_to) == ({}, None)
-        milk.attach(cereal)
-        scene.milk.detach(scene.cereal)
-        assert milk.attachments == {cereal: None}
-        assert scene.milk.attachments == {}
