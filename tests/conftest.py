@@ -96,7 +96,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         nargs="?",
         const="",
         metavar="COMMIT",
-        help="of the tests marked soak, run the twentieth whose turn COMMIT is (without one: the commit checked out),"
+        help="of the tests marked soak, run the thirtieth whose turn COMMIT is (without one: the commit checked out),"
         " with loops shortened; use with -m soak",
     )
 

@@ -1,4 +1,4 @@
-"""Choose the turn of the soak that a commit runs: a twentieth of the tests marked `soak`, another at another commit.
+"""Choose the turn of the soak that a commit runs: a thirtieth of the tests marked `soak`, another at another commit.
 
     python -m pytest -m soak --soak-turn              the turn of the commit that is checked out, as .ci/run does
     python -m pytest -m soak --soak-turn=4f1c2ab      the turn of that commit, again
@@ -16,8 +16,8 @@ import subprocess
 from pathlib import Path
 from typing import Final
 
-TURNS: Final = 20
-"""Twenty turns limit each to a few minutes of two cores."""
+TURNS: Final = 30
+"""Thirty turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
 SLOW_AT_EACH_COMMIT: Final = frozenset({"crash", "promises", "pycram"})
 """The folders whose slow tests run at each commit, as do the tests that tests/README.md names for promises and defects.
