@@ -528,19 +528,6 @@ def _aside(pose: Pose, goal: tuple[float, float]) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.soak  # one place for both is required before
-def test_the_requested_arms_reach(scene: Scene) -> None:
-    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
-
-    def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
-        return {each.reachable_arms for each in AccessingLocation(handle, scene.robot, arm)}
-
-    assert reaching(Arms.RIGHT) == {(Arms.RIGHT,)}
-    assert reaching(Arms.BOTH) == {(Arms.LEFT, Arms.RIGHT)}
-    assert reaching(None) == {(Arms.LEFT,), (Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)}
-
-
-@pytest.mark.slow
 def test_resolving_moves_nothing_and_is_recorded_once(scene: Scene) -> None:
     handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
     before = scene.world.save_state()

@@ -160,11 +160,6 @@ def test_an_ik_error_names_the_arm_and_the_pose() -> None:
     assert (again.args, str(again)) == (failure.args, str(failure))
 
 
-def test_a_plan_failure_is_an_outcome_and_no_fault_of_the_package() -> None:
-    assert not issubclass(PlanFailure, PycrormError)
-    assert issubclass(PlanFailure, Exception)
-
-
 def test_several_failures_are_a_plan_failure_and_a_group() -> None:
     one, two = ObjectLost("gone", "milk"), IKError(Pose([1, 2, 3]), Arms.LEFT, "tool")
     both = PlanFailures("2 of 2 branches failed", [one, two])

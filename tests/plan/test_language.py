@@ -1,4 +1,4 @@
-"""The plan language, in the reference system's own tests: their names, and what they were meant to test.
+"""The plan language, in the cases of the reference system's own tests.
 
 Where this language differs by design the test notes it: expressions raise when they fail, and two branches may require
 the same hand, because they take turns.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -48,131 +50,92 @@ def park() -> ParkArmsAction:
     return ParkArmsAction([Arms.BOTH])
 
 
-def test_inheritance() -> None:
-    for each in (navigate(), navigate().resolve(), Code(print), navigate() + park()):
+LEFT, RIGHT = (PickUpAction([], [arm], [Grasp.FRONT]) for arm in (Arms.LEFT, Arms.RIGHT))
+A, B, C, D = navigate(), park(), MoveTorsoAction([0.3]), navigate(2.0)
+
+
+def test_every_designator_description_and_expression_has_the_operators() -> None:
+    for each in (A, A.resolve(), Code(print), A + B):
         assert isinstance(each, Composable)
         assert all(hasattr(each, operator) for operator in OPERATORS)
-    assert isinstance(navigate() + park(), Expression)
+    assert isinstance(A + B, Expression)
 
 
-def test_simplify_tree() -> None:
-    a, b, c, d = navigate(), park(), MoveTorsoAction([0.3]), navigate(2.0)
-    assert (a + b + c).operands == (a, b, c)
-    assert (a + (b + c)).operands == (a, b, c)
-    assert ((a + b) + (c + d)).operands == (a, b, c, d)
-    assert (a | (b | (c | d))).operands == (a, b, c, d)
-    assert (a ^ (b ^ c)).operands == (a, b, c)
-    assert (a - b - (c - d)).operands == (a, b, c, d)
-    assert Sequential(a, Sequential(b, c)).operands == (a, b, c)
-    plan = a + (b + c)
-    assert plan.simplify() is plan
+EXPRESSIONS: list[tuple[Expression, type[Expression], tuple[Composable, ...]]] = [
+    (A + B, Sequential, (A, B)),
+    (A | B, Parallel, (A, B)),
+    (A - B, TryInOrder, (A, B)),
+    (A ^ B, TryAll, (A, B)),
+    (A + (B + C), Sequential, (A, B, C)),
+    ((A + B) + (C + D), Sequential, (A, B, C, D)),
+    (A | (B | (C | D)), Parallel, (A, B, C, D)),
+    (A ^ (B ^ C), TryAll, (A, B, C)),
+    (A - B - (C - D), TryInOrder, (A, B, C, D)),
+    (Sequential(A, Sequential(B, C)), Sequential, (A, B, C)),
+    (LEFT | RIGHT, Parallel, (LEFT, RIGHT)),  # the reference system refuses it; here both take turns
+    (LEFT ^ RIGHT, TryAll, (LEFT, RIGHT)),
+    (A * 5, Repeat, (A,)),
+    (5 * A, Repeat, (A,)),
+]
 
 
-def test_sequential_construction() -> None:
-    a, b = navigate(), park()
-    plan = a + b
-    assert type(plan) is Sequential
-    assert plan.operands == (a, b)
+def test_an_operator_makes_an_expression_of_its_kind_without_nesting_it_in_another() -> None:
+    for plan, kind, operands in EXPRESSIONS:
+        assert type(plan) is kind
+        assert plan.operands == operands
+        assert plan.simplify() is plan
+        assert not isinstance(plan, Repeat) or plan.times == 5
 
 
-def test_parallel_construction() -> None:
-    a, b = navigate(), park()
-    plan = a | b
-    assert type(plan) is Parallel
-    assert plan.operands == (a, b)
-
-
-def test_try_in_order_construction() -> None:
-    a, b = navigate(), park()
-    plan = a - b
-    assert type(plan) is TryInOrder
-    assert plan.operands == (a, b)
-
-
-def test_try_all_construction() -> None:
-    a, b = navigate(), park()
-    plan = a ^ b
-    assert type(plan) is TryAll
-    assert plan.operands == (a, b)
-
-
-def test_combination_construction() -> None:
-    a, b, c = navigate(), park(), MoveTorsoAction([0.3])
-    plan = a + b | c
+def test_expressions_of_different_kinds_nest() -> None:
+    plan = A + B | C
     assert type(plan) is Parallel
     sequence, lift = plan.operands
     assert isinstance(sequence, Sequential)
-    assert (sequence.operands, lift) == ((a, b), c)
+    assert (sequence.operands, lift) == ((A, B), C)
 
 
-def test_code_construction() -> None:
+def test_code_is_a_designator_of_its_function() -> None:
     code = Code(math.hypot)
-    plan = navigate() + code
     assert isinstance(code, Designator)
-    assert plan.operands[1] is code
+    assert (A + code).operands[1] is code
     assert (code.function, code.arguments) == ("math.hypot", {})
     with pytest.raises(NotALanguageExpression, match="Code needs a function, got 3"):
         Code(3)  # type: ignore[arg-type]  # what is refused
 
 
-def test_pickup_par_construction() -> None:
-    # The reference system refuses this. Here both take turns when they need the same parts, see
-    # test_language_resources.
-    left, right = (PickUpAction([], [arm], [Grasp.FRONT]) for arm in (Arms.LEFT, Arms.RIGHT))
-    assert (left | right).operands == (left, right)
-
-
-def test_pickup_try_all_construction() -> None:
-    left, right = (PickUpAction([], [arm], [Grasp.FRONT]) for arm in (Arms.LEFT, Arms.RIGHT))
-    assert (left ^ right).operands == (left, right)
-
-
-def test_monitor_construction() -> None:
+def test_a_monitor_has_the_name_of_its_condition_and_one_operand() -> None:
     def sees_milk() -> bool:
         return True
 
-    sequence = navigate() + park()
+    sequence = A + B
     plan = sequence >> Monitor(sees_milk)
     assert type(plan) is Monitor
     assert plan.operands == (sequence,)
-    assert plan.condition.endswith("test_monitor_construction.<locals>.sees_milk")
+    assert plan.condition.endswith("<locals>.sees_milk")
     assert plan.interval_s == 0.1
 
 
-def test_monitor_construction_error() -> None:
-    with pytest.raises(NotALanguageExpression, match="this Monitor has no operand"):
-        Monitor(lambda: True) >> Monitor(lambda: False)
-    with pytest.raises(NotALanguageExpression, match=r"Monitor needs a callable or an asyncio\.Event, got bool"):
-        Monitor(True)  # type: ignore[arg-type]  # what is refused
-    with pytest.raises(NotALanguageExpression, match="the right operand of >> must be a Monitor"):
-        navigate() >> park()
-    with pytest.raises(NotALanguageExpression, match="this Monitor has an operand already"):
-        navigate() >> (park() >> Monitor(lambda: True))
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Monitor(lambda: True) >> Monitor(lambda: False), "this Monitor has no operand"),
+        (lambda: Monitor(True), r"Monitor needs a callable or an asyncio\.Event, got bool"),  # type: ignore[arg-type]
+        (lambda: A >> B, "the right operand of >> must be a Monitor"),
+        (lambda: A >> (B >> Monitor(lambda: True)), "this Monitor has an operand already"),
+        *(
+            (lambda times=times: A * times, "Repeat needs an integer times >= 0")
+            for times in (1.5, "2", -1, True, None)
+        ),
+        (lambda: -1 * A, "Repeat needs an integer times >= 0"),
+    ],
+)
+def test_an_impossible_expression_is_refused_when_it_is_made(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(NotALanguageExpression, match=message):
+        make()
 
 
-def test_repeat_construction() -> None:
-    a = navigate()
-    plan = a * 5
-    assert type(plan) is Repeat
-    assert (plan.operands, plan.times) == ((a,), 5)
-
-
-def test_repeat_construction_reverse() -> None:
-    a = navigate()
-    plan = 5 * a
-    assert type(plan) is Repeat
-    assert (plan.operands, plan.times) == ((a,), 5)
-
-
-@pytest.mark.parametrize("times", [1.5, "2", -1, True, None])
-def test_repeat_construction_error(times: int) -> None:
-    with pytest.raises(NotALanguageExpression, match="Repeat needs an integer times >= 0, got"):
-        navigate() * times
-    with pytest.raises(NotALanguageExpression, match="Repeat needs an integer times >= 0, got"):
-        times * navigate()
-
-
-async def test_perform_desig(scene: Scene) -> None:
+async def test_designators_are_performed_in_order(scene: Scene) -> None:
     outcome = await (navigate(0.3, 0.3) + MoveTorsoAction([0.3]) + park()).perform()
     assert outcome == Outcome((None, None, None), (0, 1, 2))
     assert scene.robot.pose.position == pytest.approx((0.3, 0.3, 0))
@@ -182,7 +145,7 @@ async def test_perform_desig(scene: Scene) -> None:
             assert scene.robot.joint_position(joint) == pytest.approx(position)
 
 
-async def test_perform_code() -> None:
+async def test_code_may_be_a_function_or_a_coroutine_function() -> None:
     def add(a: int, b: int) -> int:
         return a + b
 
@@ -194,8 +157,7 @@ async def test_perform_code() -> None:
     assert outcome.results == (42, "done")
 
 
-async def test_perform_parallel() -> None:
-    # Threads there; tasks here, each with a name.
+async def test_branches_are_tasks_with_names() -> None:
     seen: list[asyncio.Task[None] | None] = []
     plan = Code(lambda: seen.append(asyncio.current_task())) | Code(lambda: seen.append(asyncio.current_task()))
     await plan.perform()
@@ -203,63 +165,53 @@ async def test_perform_parallel() -> None:
     assert [task.get_name() for task in seen if task is not None] == ["Parallel 0: Code", "Parallel 1: Code"]
 
 
-async def test_perform_repeat() -> None:
-    count = 0
-
-    def increment() -> int:
-        nonlocal count
-        count += 1
-        return count
-
-    outcome = await (Code(increment) * 10).perform()
-    assert count == 10
+async def test_a_repetition_returns_the_result_of_each_round() -> None:
+    count = iter(range(1, 11))
+    outcome = await (Code(lambda: next(count)) * 10).perform()
     assert (outcome.rounds, outcome.results) == (10, tuple(range(1, 11)))
 
 
-def raiser(failure: PlanFailure) -> Code:
+@pytest.mark.parametrize(
+    ("combine", "succeeds", "moves"),
+    [
+        (lambda failing, then: failing + then, False, False),
+        (lambda failing, then: failing - then, True, True),
+        (lambda failing, then: failing | then, False, True),
+        (lambda failing, then: failing ^ then, True, True),
+    ],
+    ids=["sequential", "in order", "parallel", "try all"],
+)
+async def test_a_failure_ends_a_sequence_and_fails_branches_and_alternatives_go_on(
+    scene: Scene, combine: Callable[[Composable, Composable], Expression], succeeds: bool, moves: bool
+) -> None:
+    failure = PlanFailure("no")
+
     def fail() -> None:
         raise failure
 
-    return Code(fail)
-
-
-async def test_exception_sequential(scene: Scene) -> None:
-    failure = PlanFailure("no")
-    with collected_tree() as tree, pytest.raises(PlanFailure) as caught:
-        await (raiser(failure) + navigate()).perform()
-    assert caught.value is failure
-    assert (tree.roots[0].status, tree.roots[0].failure) == (TaskStatus.FAILED, failure)
-    assert scene.robot.pose.position == pytest.approx((0, 0, 0))
-
-
-async def test_exception_try_in_order(scene: Scene) -> None:
-    failure = PlanFailure("no")
     with collected_tree() as tree:
-        outcome = await (raiser(failure) - navigate()).perform()
-    assert tree.roots[0].status is TaskStatus.SUCCEEDED
-    assert (outcome.failures, outcome.succeeded) == ((failure,), (1,))
-    assert scene.robot.pose.position == pytest.approx((1, 1, 0))
+        if succeeds:
+            outcome = await combine(Code(fail), A).perform()
+            assert (outcome.failures, outcome.succeeded) == ((failure,), (1,))
+        else:
+            with pytest.raises(PlanFailure) as caught:
+                await combine(Code(fail), A).perform()
+            assert caught.value is failure
+    status = TaskStatus.SUCCEEDED if succeeds else TaskStatus.FAILED
+    assert (tree.roots[0].status, tree.roots[0].failure) == (status, None if succeeds else failure)
+    assert scene.robot.pose.position == pytest.approx((1, 1, 0) if moves else (0, 0, 0))
 
 
-async def test_exception_parallel(scene: Scene) -> None:
-    failure = PlanFailure("no")
-    with collected_tree() as tree, pytest.raises(PlanFailure) as caught:
-        await (raiser(failure) | navigate()).perform()
-    assert caught.value is failure
-    assert (tree.roots[0].status, tree.roots[0].failure) == (TaskStatus.FAILED, failure)
-    assert scene.robot.pose.position == pytest.approx((1, 1, 0))
+async def test_alternatives_that_all_fail_raise_all_failures() -> None:
+    one, two = PlanFailure("one"), PlanFailure("two")
 
+    def fail(failure: PlanFailure) -> None:
+        raise failure
 
-async def test_exception_try_all(scene: Scene) -> None:
-    failure = PlanFailure("no")
-    with collected_tree() as tree:
-        outcome = await (raiser(failure) ^ navigate()).perform()
+    for plan in (Code(fail, failure=one) ^ Code(fail, failure=two), Code(fail, failure=one) - Code(fail, failure=two)):
         with pytest.raises(PlanFailures) as caught:
-            await (raiser(failure) ^ raiser(failure)).perform()
-    assert [node.status for node in tree.roots] == [TaskStatus.SUCCEEDED, TaskStatus.FAILED]
-    assert (outcome.failures, outcome.succeeded) == ((failure,), (1,))
-    assert caught.value.exceptions == (failure, failure)
-    assert isinstance(tree.roots[0].designator, TryAll)
+            await plan.perform()
+        assert caught.value.exceptions == (one, two)
 
 
 async def test_descriptions_are_resolved_when_they_are_performed(scene: Scene) -> None:

@@ -116,19 +116,6 @@ def test_candidates_are_on_the_floor_face_the_target_and_are_clear_of_furniture(
     assert distances == pytest.approx(sorted(distances))
 
 
-@pytest.mark.soak  # test_doors requires both arms of one place
-@pytest.mark.slow
-def test_the_requested_arms_reach(scene: Scene) -> None:
-    def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
-        resolved_location = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=arm)
-        return {each.reachable_arms for each in resolved_location}
-
-    scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(1.0)))
-    assert reaching(Arms.RIGHT) == {(Arms.RIGHT,)}
-    assert reaching(Arms.BOTH) == {(Arms.LEFT, Arms.RIGHT)}
-    assert {(Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)} <= reaching(None)
-
-
 @pytest.mark.slow
 async def test_from_a_candidate_for_visibility_the_object_is_seen(scene: Scene) -> None:
     Object("wall", ObjectType.GENERIC_OBJECT, box_urdf("wall", x=(-0.02, 0.02), y=(-0.3, 0.3), z=(0, 2)),
@@ -277,15 +264,6 @@ def test_a_loop_that_runs_to_its_end_chose_none(scene: Scene) -> None:
         ("SemanticCostmapLocation", tuple(Candidate(each.pose) for each in reported), None, len(places), None)
     ]
     assert recording.offered_beyond == [len(places) - CANDIDATES_MAX]
-
-
-def test_of_thousands_of_candidates_the_first_and_the_chosen_one_are_recorded(scene: Scene) -> None:
-    with Recording().listening() as recording:
-        places = list(itertools.islice(iter(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen)), 1_500))
-    ((_, candidates, taken, _, _),) = recording.places
-    assert (len(candidates), taken, recording.offered_beyond) == (CANDIDATES_MAX, CANDIDATES_MAX - 1, [500])
-    assert [each.pose for each in candidates[:-1]] == [each.pose for each in places[: CANDIDATES_MAX - 1]]
-    assert candidates[-1].pose == places[-1].pose
 
 
 def test_an_unused_location_is_not_recorded(scene: Scene) -> None:

@@ -118,11 +118,13 @@ async def test_holding_again_changes_nothing_and_holding_detaches_an_object_from
         assert (tray.attachments, scene.robot.attachments) == ({}, {scene.milk: LEFT_TOOL})
 
 
-async def test_a_full_hand_neither_holds_nor_grasps_another_object(scene: Scene) -> None:
+async def test_a_full_hand_neither_picks_up_nor_holds_nor_grasps_another_object(scene: Scene) -> None:
     await reached(scene, 1.3)
     scene.robot.attach(scene.cereal, LEFT_TOOL)
     before = scene.world.save_state()
     for action in (
+        PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT),
+        TransportActionPerformable(scene.milk, Arms.LEFT, Pose([-1.3, 1, 0.95])),
         GripActionPerformable(Arms.LEFT, scene.milk, 1.0),
         GraspingActionPerformable(Arms.LEFT, scene.milk),
         GraspingActionPerformable(Arms.LEFT, ObjectPart("sink_area_drawer_handle", scene.kitchen)),
@@ -267,12 +269,15 @@ async def test_an_arm_that_the_robot_lacks_is_a_failure_and_moves_nothing(scene:
     assert (scene.robot.joint_position("l_shoulder_pan_joint"), fingers(scene)) == (1.712, {0.548})
 
 
-async def test_an_object_outside_the_world_is_neither_held_nor_grasped_nor_transported(scene: Scene) -> None:
+async def test_an_object_outside_the_world_is_neither_picked_up_nor_held_nor_grasped_nor_transported(
+    scene: Scene,
+) -> None:
     scene.world.remove(scene.milk)
     believed = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.3, 1, 0.9]))
     before = scene.world.save_state()
     for meant in (scene.milk, designator_of(scene.milk), believed):
         for action in (
+            PickUpActionPerformable(meant, Arms.LEFT, Grasp.FRONT),
             GripActionPerformable(Arms.LEFT, meant, 1.0),
             ReleaseActionPerformable(Arms.LEFT, meant),
             GraspingActionPerformable(Arms.LEFT, meant),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import os
 import signal
-import tracemalloc
 from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -182,16 +180,6 @@ async def test_the_recorder_of_the_start_is_notified_of_the_end() -> None:
     assert (first.notes, second.notes) == (["start Switching", "end Switching SUCCEEDED"], [])
 
 
-async def test_a_plan_that_is_cancelled_in_the_middle_ends_every_open_node_as_cancelled() -> None:
-    with Recording().listening() as recording:
-        plan = asyncio.create_task(Inside([Empty(), Waiting(asyncio.Event()), Empty()]).perform())
-        await recording.wait_for_notes(4)
-        plan.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await plan
-    assert recording.notes[3:] == ["start Waiting", "end Waiting CANCELLED", "end Inside CANCELLED"]
-
-
 async def test_a_plan_that_never_suspends_can_be_cancelled() -> None:
     class Endless(ActionAbstract):
         async def perform(self) -> None:
@@ -313,53 +301,6 @@ async def test_an_abandoned_suspended_plan_does_not_change_the_current_node_of_o
         dropped.close()
         assert current_node.get() is here
     assert recording.notes[2:] == ["end Waiting ERROR", "end Inside ERROR"]
-
-
-async def test_a_failed_perform_leaves_nothing_for_the_garbage_collector() -> None:
-    class Failing(ActionAbstract):
-        async def perform(self) -> None:
-            raise PlanFailure("x")
-
-    async def plan() -> None:
-        for _ in range(10):
-            try:
-                await Inside([Failing()]).perform()
-            except PlanFailure:
-                continue
-
-    def nodes() -> list[TaskTreeNode]:
-        return [each for each in gc.get_objects() if isinstance(each, TaskTreeNode)]
-
-    await plan()
-    gc.collect()
-    before = nodes()
-    gc.disable()
-    try:
-        await plan()
-        assert len(nodes()) == len(before)
-        assert not any(isinstance(each, Failing) for each in gc.get_objects())
-    finally:
-        gc.enable()
-
-
-@pytest.mark.soak  # promises/test_defects_of_storage holds it with a memory
-async def test_a_plan_of_a_hundred_thousand_performs_keeps_memory_flat() -> None:
-    class Many(ActionAbstract):
-        async def perform(self) -> None:
-            for _ in range(2_000):
-                await Inside([Empty()]).perform()
-
-    await Many().perform()
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        for _ in range(25):
-            await Many().perform()
-        after, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert after - before < 50_000
-    assert peak - before < 500_000
 
 
 @contextmanager

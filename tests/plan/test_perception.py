@@ -26,7 +26,7 @@ from pycrorm_async.plan import (
     collected_tree,
 )
 from pycrorm_async.plan.execution import Seen, recorder
-from pycrorm_async.plan.failures import CapabilityAbsenceFailure, PerceptionObjectNotFound
+from pycrorm_async.plan.failures import PerceptionObjectNotFound
 from pycrorm_async.plan.motions import SimulatedModules
 from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.world import Arms, Grasp, Limits, Object, ObjectType, Pose
@@ -35,7 +35,6 @@ from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
-from tests.plan.test_motions import Noting
 from tests.world.loaded_model import bullet_frame
 
 DetectionNote = tuple[str, ObjectType | None, tuple[Seen, ...], TaskTreeNode | None]
@@ -264,16 +263,6 @@ async def test_percepts_of_a_users_robot_are_recorded_too(scene: Scene, listenin
     with ChosenRobot("blind", Seeing()), pytest.raises(PerceptionObjectNotFound, match="no MILK was perceived"):
         await DetectingMotion(ObjectType.MILK).perform()
     assert [each[2] for each in listening.detections] == [seen, ()]
-
-
-async def test_a_robot_without_a_method_for_a_motion_cannot_perform_it(scene: Scene, listening: Listening) -> None:
-    with ChosenRobot("old", Noting()):
-        for motion in (DetectingMotion(ObjectType.MILK), WorldStateDetectingMotion(ObjectType.MILK)):
-            name = type(motion).__name__
-            with pytest.raises(CapabilityAbsenceFailure, match=f"the old robot cannot do {name}: Noting") as caught:
-                await motion.perform()
-            assert caught.value.data == ("old", name)
-    assert listening.detections == []
 
 
 def test_a_search_needs_an_object_type(scene: Scene) -> None:

@@ -140,24 +140,6 @@ async def test_an_exception_leaves_a_simulation_and_the_world_is_as_before(scene
     assert len(tree) == 2
 
 
-async def test_a_cancelled_simulation_leaves_the_world_as_before(scene: Scene) -> None:
-    began = asyncio.Event()
-
-    async def dreaming() -> None:
-        with SimulatedTaskTree():
-            await NavigateActionPerformable(THERE).perform()
-            began.set()
-            await asyncio.sleep(60)
-
-    task = asyncio.create_task(dreaming())
-    await began.wait()
-    assert scene.robot.pose == Pose()
-    task.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await task
-    assert scene.robot.pose == Pose()
-
-
 class Suspended:
     """An await that never ends."""
 

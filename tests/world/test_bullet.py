@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 import pycrorm_async.world as worlds
-from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
 from pycrorm_async.world.body import WorldState
 from pycrorm_async.world.pose import (
@@ -23,7 +22,6 @@ from pycrorm_async.world.pose import (
     PoseRefused,
     UnknownJoint,
     WorldClosed,
-    WorldError,
     WorldUnavailable,
 )
 from tests.bullet import ENGINE
@@ -144,11 +142,6 @@ def test_a_window_without_a_display_is_refused(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(WorldUnavailable, match="DISPLAY"), BulletWorld(WorldMode.GUI, engine="bullet"):
         pytest.fail("entered")
     assert current_world.get() is None
-
-
-def test_refusals_of_a_world_are_the_callers_errors() -> None:
-    assert issubclass(WorldError, CallerError)
-    assert issubclass(WorldClosed, WorldError)
 
 
 # --- concurrent worlds ------------------------------------------------------------------------------------------------

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import pytest
 
-from pycrorm_async.world import Arms, BulletWorld, JointType, Object, ObjectType, OccupancyCostmap, Pose
-from pycrorm_async.world.kinematics import Unreachable, solve
-from pycrorm_async.world.pose import JointLimitExceeded, rotated, yaw_quaternion
+from pycrorm_async.world import BulletWorld, JointType, Object, ObjectType, OccupancyCostmap, Pose
+from pycrorm_async.world.pose import JointLimitExceeded, rotated
 
 
 @pytest.fixture
@@ -105,46 +103,3 @@ def test_the_fridge_door_rotates_into_the_room_about_its_right_edge(kitchen: Obj
     assert kitchen.link_pose(handle).position == pytest.approx((0.95, -0.66, 0.95), abs=1e-9)
     kitchen.set_joint_position(joint, math.pi / 2)
     assert kitchen.link_pose(handle).position == pytest.approx((1.05 - 0.59, -1.25 - 0.10, 0.95), abs=1e-9)
-
-
-def reachable_from(world: BulletWorld, robot: Object, targets: Iterable[Pose]) -> bool:
-    """Return whether one arm reaches all the targets from one of the free places around the first one, facing it."""
-    targets = list(targets)
-    goal = targets[0].position
-    for place in OccupancyCostmap(world, Pose([goal.x, goal.y, 0])).best(600)[::20]:
-        heading = math.atan2(goal.y - place.position.y, goal.x - place.position.x)
-        robot.set_pose(Pose(place.position, yaw_quaternion(heading)))
-        for arm in (Arms.LEFT, Arms.RIGHT):
-            try:
-                for target in targets:
-                    solve(robot, arm, target)
-            except Unreachable:
-                continue
-            return True
-    return False
-
-
-@pytest.fixture
-def robot(world: BulletWorld, kitchen: Object) -> Object:
-    robot = Object("pr2", ObjectType.ROBOT)
-    robot.set_joint_position("torso_lift_joint", 0.3)
-    return robot
-
-
-def test_cereal_and_milk_can_be_picked_up_from_free_floor(world: BulletWorld, robot: Object) -> None:
-    for packet in cereal_and_milk():
-        x, y, z = packet.pose.position
-        assert reachable_from(world, robot, [Pose([x, y, z]), Pose([x - 0.07, y, z]), Pose([x, y, z + 0.03])])
-
-
-def test_an_object_can_be_placed_on_the_island_from_free_floor(world: BulletWorld, robot: Object) -> None:
-    facing_it = yaw_quaternion(math.pi)
-    assert reachable_from(world, robot, [Pose([-1.30, 1.0, 1.0], facing_it), Pose([-1.30, 1.0, 1.05], facing_it)])
-
-
-@pytest.mark.parametrize("drawer", DRAWERS)
-def test_every_drawer_can_be_pulled_open_from_free_floor(
-    world: BulletWorld, kitchen: Object, robot: Object, drawer: str
-) -> None:
-    closed = kitchen.link_pose(f"{drawer}_handle")
-    assert reachable_from(world, robot, [closed, closed @ Pose([-0.30, 0, 0])])
