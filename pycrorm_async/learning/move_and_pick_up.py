@@ -661,17 +661,9 @@ class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
         raise CallerError("a recalled pick-up asks the memory: iterate with `async for`, or `await …resolve()`")
 
     async def __aiter__(self) -> AsyncIterator[MoveAndPickUpPerformable]:
-        """Yield the way with the highest expected success that was not yielded yet, then the policy's samples."""
-        source = self._experience if self._experience is not None else experience.get()
-        if source is not None:
-            region = free_and_visible(objects.require_robot(), objects.in_world(self.target))
-            clearance = base_clearance()
-            tried: set[PickUpChoice] = set()
-            while (best := await self._best(source, region, clearance, tried)) is not None:
-                choice, way = best
-                tried.add(choice)
-                recalled = replace(self._default.chosen(choice), policy=None)
-                yield self._performable_of(recalled, "recall", expected=way.score)
+        """Yield the ways of `recalled`, then the policy's samples."""
+        async for recalled in self.recalled():
+            yield recalled
         for description, chosen_by in self._otherwise:
             try:
                 for move in description:
@@ -679,6 +671,20 @@ class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
             except ObjectUnreachable:  # a learned policy may know no way at this height
                 if description is self._default:
                     raise
+
+    async def recalled(self) -> AsyncIterator[MoveAndPickUpPerformable]:
+        """Yield the way with the highest expected success that was not yielded yet, while there is one."""
+        source = self._experience if self._experience is not None else experience.get()
+        if source is None:
+            return
+        region = free_and_visible(objects.require_robot(), objects.in_world(self.target))
+        clearance = base_clearance()
+        tried: set[PickUpChoice] = set()
+        while (best := await self._best(source, region, clearance, tried)) is not None:
+            choice, way = best
+            tried.add(choice)
+            recalled = replace(self._default.chosen(choice), policy=None)
+            yield self._performable_of(recalled, "recall", expected=way.score)
 
     async def _best(
         self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]

@@ -27,26 +27,26 @@ from itertools import compress, product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pycrorm_async.errors import ImpossibleCondition
 from pycrorm_async.learning.features import PickUpContext
 from pycrorm_async.learning.move_and_pick_up import (
     HEIGHT_TOLERANCE_M,
-    PROPOSALS,
     MoveAndPickUp,
     RecalledPickUp,
     context_of,
     free_and_visible,
 )
-from pycrorm_async.learning.policy import Evidence, Floats, PickUpChoice, Policy
+from pycrorm_async.learning.policy import Evidence, Floats, PickUpChoice, Policy, Region
 from pycrorm_async.learning.policy_file import AnyPolicy
 from pycrorm_async.learning.success_model import SuccessModel
 from pycrorm_async.plan import failures, geometry, locations, objects
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.execution import Refusal
-from pycrorm_async.plan.motions import collisions_count
+from pycrorm_async.plan.motions import chosen_limits, collisions_count
 from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.kinematics import chain_of
+from pycrorm_async.world.kinematics import chain_of, within_reach
 from pycrorm_async.world.pose import Arms, Grasp, Pose, dot
 from pycrorm_async.world.queries import OccupancyCostmap
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS
@@ -68,8 +68,7 @@ class TransportPolicy:
 
     Args:
         policy: a success model or a learned policy; None prefers nothing: the first possible way, in random order.
-        recall: fetch first in the ways that succeeded before, by the open memory, then in those of the policy
-            (`RecalledPickUp`).
+        recall: fetch first in the ways that succeeded before, by the open memory (`RecalledPickUp`).
         checked: leave out ways that kinematics, or where collisions count a collision, forbids. Without it the
             experience alone decides.
         rng: random generator of the order and the shift of the places; None means a new one with an unpredictable seed.
@@ -104,26 +103,23 @@ class TransportPolicy:
             return self.takes(target, arm, grasp)
 
         if self._recalls:
-            otherwise = self.policy if self.policy != SuccessModel.untrained() else None
-            async for way in RecalledPickUp(target, arms, policy=otherwise, samples=PROPOSALS, rng=self._rng):
-                hold = way.arm, way.grasp
-                if takes(*hold) and self.reaches(way, getattr(way, "torso", None)) and await places.chance(*hold):
-                    yield way
-            return
+            async for recalled in RecalledPickUp(target, arms).recalled():
+                hold = recalled.arm, recalled.grasp
+                if takes(*hold) and self.reaches(recalled) and await places.chance(*hold):
+                    yield recalled
         action = MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
         action.keep_policy()
         obj = objects.in_world(target)
         region, context = free_and_visible(objects.require_robot(), obj), action.context_for(self.policy)
         holds = [hold for hold in product(arms, Grasp) if takes(*hold)]
+        goals = [geometry.pick_up_poses(obj.pose, grasp, Pose())[1:] for _, grasp in holds]
         weights: dict[int, float] = {}
         tried: list[PickUpChoice] = []
         for _ in range(FETCHING_SEARCHES if holds else 0):
-            stands = self.stands(obj.pose)
-            seeing = region.contains(*np.array([each[:2] for each in stands]).reshape(-1, 2).T)
-            stands = [*compress(stands, seeing)]
-            choices = self.choices(stands, holds, context)
-            hold_of = np.arange(len(choices)) % len(holds)
-            chances = self.chances(choices, context) * np.array([weights.get(each, 1.0) for each in hold_of.tolist()])
+            ways = self.ways(self.stands(obj.pose, region=region), holds, goals, context)
+            choices, hold_of = ways.choices, ways.holds
+            chances = self.chances(choices, context)
+            chances *= np.array([weights.get(each, 1.0) for each in hold_of.tolist()])
             for each in tried:
                 chances *= 1 - _alike(each, choices) / 2
             while chances.any():
@@ -179,39 +175,55 @@ class TransportPolicy:
 
     # --- searching --------------------------------------------------------------------------------------------
 
-    def stands(self, at: Pose, *, turned: bool = False) -> list[Stand]:
+    def stands(self, at: Pose, *, turned: bool = False, region: Region | None = None) -> list[Stand]:
         """Return the places within reach of a pose, in random order, at which the base is clear of obstacles.
 
         The base faces the pose, or is turned from that by a random angle. Without collisions, places may be occupied.
+        `region` bounds the places, in the upright frame of the pose.
         """
         robot, clearance, height_m = objects.require_robot(), locations.base_clearance(), locations.base_height_m()
         steps = math.ceil((reach_m := _reach_m(robot)) / CELL_M)
         axis = np.arange(-steps, steps + 1) * CELL_M
         places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + self._rng.uniform(0, CELL_M, 2)
         places = self._rng.permutation(places[np.hypot(*places.T) <= reach_m])
+        if region is not None:
+            places = places[region.contains(*places.T)]
         turns = self._rng.uniform(-_TURN_RAD, _TURN_RAD, len(places)) * turned
         cos, sin, (x, y, _) = math.cos(at.yaw), math.sin(at.yaw), at.position
         stands = []
         for (ahead, aside), turn in zip(places.tolist(), turns.tolist(), strict=True):
             place = Pose((x + cos * ahead - sin * aside, y + sin * ahead + cos * aside, 0.0))
-            base = locations.face(place, at, height_m=height_m, turned=turn)
-            if clearance is None or clearance.refusal(base) is None:
-                stands.append(Stand(ahead, aside, base))
-        return stands
+            stands.append(Stand(ahead, aside, locations.face(place, at, height_m=height_m, turned=turn)))
+        return stands if clearance is None else [*compress(stands, clearance.clear([each.base for each in stands]))]
 
-    def choices(
-        self, stands: Sequence[Stand], holds: Sequence[tuple[Arms, Grasp]], context: PickUpContext
-    ) -> list[PickUpChoice]:
-        """Return each combination; the arm and the grasp change first, then the height of the torso."""
+    def ways(
+        self,
+        stands: Sequence[Stand],
+        holds: Sequence[tuple[Arms, Grasp]],
+        goals: Sequence[Sequence[Pose]],
+        context: PickUpContext,
+    ) -> Ways:
+        """Return each combination whose arm is neither too far from its goals nor too near; `goals` are by hold.
+
+        The arm and the grasp change first, then the height of the torso.
+        """
+        robot = objects.require_robot()
         torsos: list[float | None] = [None]
         if context.torso_limits is not None and not isinstance(self.policy, Policy):
             torsos = np.linspace(*context.torso_limits, TORSOS).tolist()
-        return [
-            PickUpChoice(arm, grasp, x, y, torso=torso)
-            for x, y, _ in stands
-            for torso in torsos
-            for arm, grasp in holds
+        possible = np.ones((len(stands), len(torsos), len(holds)), dtype=bool)
+        for number, ((arm, _), targets) in enumerate(zip(holds, goals, strict=True)):
+            if self.is_checked and arm in robot.description.arms:
+                bases = [each.base for each in stands]
+                possible[..., number] = within_reach(
+                    robot.body, arm, targets, bases=bases, torso_heights=torsos, limits=chosen_limits()
+                )
+        at, torso_of, hold_of = np.nonzero(possible)
+        choices = [
+            PickUpChoice(*holds[hold], *stands[stand][:2], torso=torsos[torso])
+            for stand, torso, hold in zip(at.tolist(), torso_of.tolist(), hold_of.tolist(), strict=True)
         ]
+        return Ways(choices, at, hold_of)
 
     def chances(self, choices: Sequence[PickUpChoice], context: PickUpContext) -> Floats:
         """Return the chance of each choice: a model's probability, of a policy its density relative to the highest.
@@ -242,6 +254,14 @@ class Stand(NamedTuple):
     x: float
     y: float
     base: Pose
+
+
+class Ways(NamedTuple):
+    """Ways to reach a pose: each choice, the number of its stand and that of its arm and grasp, shape (choices,)."""
+
+    choices: list[PickUpChoice]
+    stands: NDArray[np.intp]
+    holds: NDArray[np.intp]
 
 
 class Places:
@@ -275,10 +295,10 @@ class Places:
         goals = self._goal @ tool, geometry.retract(self._goal @ tool)
         for number in range(PLACING_SEARCHES):
             stands = self._search(number)
-            choices = self._ways.choices(stands, [(arm, grasp)], self._context)
+            choices, stand_of, _ = self._ways.ways(stands, [(arm, grasp)], [goals], self._context)
             chances = self._ways.chances(choices, self._context)
             for at in np.argsort(-chances, kind="stable").tolist():
-                base, torso, chance = stands[at * len(stands) // len(choices)].base, choices[at].torso, chances[at]
+                base, torso, chance = stands[stand_of[at]].base, choices[at].torso, chances[at]
                 reach = locations.PlaceReach((arm,))
                 if self._ways.is_checked:
                     reach = locations.reaching_arms(robot, arm, base, lambda _: goals, torso_height=torso, grasps=False)

@@ -21,9 +21,10 @@ Descriptions with alternatives are in `actions`.
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
 from functools import partial
@@ -449,7 +450,7 @@ class _Way:
     """The way that a `TransportWays` has chosen: the pick-up, and the next place for placing that was not tried yet."""
 
     fetch: MoveAndPickUpPerformable | None
-    next_place: Callable[[], Location | None]
+    next_place: Callable[[], Awaitable[Location | None]]
 
 
 @dataclass
@@ -496,17 +497,17 @@ class TransportActionPerformable(CheckedAction):
                 await self._drive(self._fetching_pose(robot.body))
                 await PickUpActionPerformable(self.object_designator, self.arm, Grasp.FRONT).perform()
             await self._park_arms()
-        place = self._placing_place(robot.body)
+        place = await self._placing_place(robot.body)
         if place.torso_height is not None:
             await MoveTorsoActionPerformable(place.torso_height).perform()
         await self._drive(place.pose)
         await PlaceActionPerformable(self.object_designator, self.arm, self.target_location).perform()
         await self._park_arms()
 
-    def _placing_place(self, body: Object) -> Location:
+    async def _placing_place(self, body: Object) -> Location:
         if self._way is None:
             return CostmapLocation(self.target_location, reachable_for=body, reachable_arm=self.arm).resolve()
-        place = self._way.next_place()
+        place = await self._way.next_place()
         if place is None:
             message = f"there is no other place to stand and reach {self.target_location}"
             raise failures.ReachabilityFailure(message, self.target_location)
@@ -722,16 +723,18 @@ class TransportAction(ActionDescription[TransportActionPerformable]):
         self, policy: TransportWays, target: objects.ObjectDesignator | Object, arms: Sequence[Arms], goal: Pose
     ) -> AsyncGenerator[TransportActionPerformable, None]:
         """Yield the ways to fetch one object for one place, and while it is held, to place it."""
-        places: dict[Arms, Iterator[Location]] = {}
+        places: dict[Arms, Iterator[Location | None]] = {}
         exhausted: set[Arms] = set()
 
-        def next_place(arm: Arms) -> Location | None:
+        async def next_place(arm: Arms) -> Location | None:
             if arm not in places:
-                places[arm] = iter(policy.placing(target, arm, goal))
-            place = next(places[arm], None)
-            if place is None:
-                exhausted.add(arm)
-            return place
+                places[arm] = policy.placing(target, arm, goal).steps()
+            for place in places[arm]:
+                if place is not None:
+                    return place
+                await asyncio.sleep(0)  # a search may take seconds
+            exhausted.add(arm)
+            return None
 
         ways = policy.fetching(target, arms, goal)
         while (arm := _holding(target)) not in exhausted:

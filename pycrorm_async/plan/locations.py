@@ -17,13 +17,14 @@ from __future__ import annotations
 import math
 import random
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pycrorm_async.plan import failures, geometry, objects
 from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Search, recorder
@@ -58,6 +59,10 @@ class BaseClearance:
             if (obstacle := self._obstacles.overlapping(footprint, base)) is not None:
                 return "base in collision with {} ({})".format(*obstacle)
         return None
+
+    def clear(self, bases: Sequence[Pose]) -> NDArray[np.bool_]:
+        """Return for each pose whether a base is clear of obstacles there, shape (bases,): faster than one by one."""
+        return np.asarray(np.all([self._obstacles.clear(each, bases) for each in self._footprints], axis=0))
 
     def costmap(self, origin: Pose, *, size_cells: int = 200, resolution_m: float = 0.02) -> queries.Costmap:
         """Return the places that a base may have with some heading: 1 where nothing is within its inner radius."""
@@ -377,6 +382,12 @@ class LocationDesignator(ABC):
 
     def __iter__(self) -> Generator[Location, None, None]:
         """Yield suitable places; the last one yielded counts as taken, or none if the iteration is exhausted."""
+        for place in self.steps():
+            if place is not None:
+                yield place
+
+    def steps(self) -> Generator[Location | None, None, None]:
+        """Yield what the iteration yields, and None for each unsuitable place, so that other tasks can run then."""
         observer, search = recorder.get(), Search(self._name(), current_node.get())
         offered = search.offered
         try:
@@ -385,10 +396,11 @@ class LocationDesignator(ABC):
                     search.cells = place
                     continue
                 search.considered += 1
-                if isinstance(place, Refusal):
-                    if len(search.refused) < REFUSALS_MAX:
-                        search.refused.append(place)
-                elif place is not None:
+                if isinstance(place, Refusal) and len(search.refused) < REFUSALS_MAX:
+                    search.refused.append(place)
+                if not isinstance(place, Location):
+                    yield None
+                else:
                     if len(offered) == CANDIDATES_MAX:
                         offered.pop()
                         search.offered_beyond += 1

@@ -319,8 +319,11 @@ class Chain:
 
     def distance_m(self, target: Pose, positions: Mapping[str, float]) -> float:
         """Return the distance of a target in the root link from the first joint of the arm, with that joint at 0."""
-        first = along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)})
-        return math.dist(first.position, target.position)
+        return math.dist(self.first_joint(positions), target.position)
+
+    def first_joint(self, positions: Mapping[str, float]) -> Vector:
+        """Return the position of the first joint of the arm in the root link, with that joint at 0."""
+        return along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)}).position
 
     def solve(
         self, target: Pose, positions: Mapping[str, float], bounds: Mapping[str, Bounds]

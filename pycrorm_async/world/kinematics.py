@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import arms as arm_ik
@@ -157,6 +158,59 @@ def _solve_chain(
         if reached.distance(goal) <= EXACT_M and turned <= EXACT_RAD:
             return joints
     raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
+
+
+def within_reach(
+    robot: Object,
+    arm: Arms,
+    targets: Sequence[Pose],
+    *,
+    bases: Sequence[Pose],
+    torso_heights: Sequence[float | None],
+    limits: Limits = Limits.SOFT,
+) -> NDArray[np.bool_]:
+    """Return whether no target is too far from the arm's first joint, or too near, shape (bases, torso heights).
+
+    Where it is False, `solve` refuses a target; where it is True, it may. It takes a hundredth of the time.
+    """
+    description = robot.robot_description
+    assert description is not None, "a robot that searches has a description"
+    ranges, offset, behind, firsts = (0.0, math.inf), 0.0, 0.0, []
+    if isinstance(description, PR2Description):
+        described = _one_arm(description.arms, description, arm)
+        bounds, names = _bounds(described, limits), described.joints
+        if limits is Limits.HARD:
+            bounds = [_narrow(each, robot.joint_limits(name)) for name, each in zip(names, bounds, strict=True)]
+        ranges, offset, behind = arm_ik.stretches_m(described, bounds), described.shoulder_offset_m, described.tool_m
+        now = robot.joint_position(description.torso_joint)
+        firsts = [_shoulder(description, described, now if each is None else each) for each in torso_heights]
+    else:
+        chain, positions, torso = chain_of(robot, arm), robot.joint_positions(), description.torso_joint
+        ranges = 0.0, chain.reach_m
+        for height in torso_heights:
+            lifted = {} if torso is None or height is None else {torso: height}
+            firsts.append(chain.first_joint(positions | lifted))
+    root = robot.root_pose(Pose())  # in the frame of the base link
+    at = np.array([each.position for each in bases]).reshape(-1, 1, 3)
+    turns = np.array([each.orientation for each in bases]).reshape(-1, 1, 4)
+    first = at + _turned(turns, np.array([(root @ Pose(each)).position for each in firsts]))
+    up = _turned(turns, np.array(rotated(root.orientation, (0.0, 0.0, 1.0))))
+    reached = np.ones((len(bases), len(torso_heights)), dtype=bool)
+    for each in targets:
+        ahead = rotated(each.orientation, (1.0, 0.0, 0.0))
+        way = np.array(each.position) - behind * np.array(ahead) - first
+        height = (way * up).sum(axis=-1)
+        across = np.sqrt(np.maximum((way**2).sum(axis=-1) - height**2, 0.0))
+        reached &= np.hypot(across - offset, height) <= ranges[1] + EXACT_M
+        reached &= np.hypot(across + offset, height) >= ranges[0] - EXACT_M
+    return reached
+
+
+def _turned(turns: Floats, vectors: Floats) -> Floats:
+    """Rotate the vectors, shape (..., 3), by unit quaternions, shape (..., 4)."""
+    axis, w = turns[..., :3], turns[..., 3:]
+    across = 2 * np.cross(axis, vectors)
+    return np.asarray(vectors + w * across + np.cross(axis, across))
 
 
 def headings(robot: Object, arm: Arms, target: Pose, *, base: Pose, limits: Limits) -> Iterator[Pose]:

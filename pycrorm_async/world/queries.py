@@ -28,7 +28,7 @@ below or above the shape. A base that overlaps no outline collides with nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
@@ -384,17 +384,26 @@ class Obstacles:
 
     def overlapping(self, footprint: Footprint, base: Pose) -> tuple[str, str] | None:
         """Return object and link of the first outline that a base at this pose overlaps; None if there is none."""
+        [overlaps] = self._overlaps(footprint, [base])
+        return self._names[int(overlaps.argmax())] if overlaps.any() else None
+
+    def clear(self, footprint: Footprint, bases: Sequence[Pose]) -> NDArray[np.bool_]:
+        """Return for each of these poses whether a base there overlaps no outline, shape (bases,)."""
+        return np.asarray(~self._overlaps(footprint, bases).any(axis=1))
+
+    def _overlaps(self, footprint: Footprint, bases: Sequence[Pose]) -> NDArray[np.bool_]:
+        """Return whether a base at each pose overlaps each outline, shape (bases, outlines)."""
+        at = np.array([(*base.position[:2], base.yaw) for base in bases]).reshape(-1, 1, 3)
+        position, yaw = at[..., :2], at[..., 2]
         half = np.array([footprint.x[1] - footprint.x[0], footprint.y[1] - footprint.y[0]]) / 2
         ahead = np.array([sum(footprint.x), sum(footprint.y)]) / 2
-        middle = np.array(base.position[:2]) + _turned(ahead, np.array(base.yaw))
-        away = self._middles - middle
-        relative = self._headings - base.yaw
-        cos, sin = np.abs(np.cos(relative))[:, None], np.abs(np.sin(relative))[:, None]
+        away = self._middles - (position + _turned(ahead, yaw))
+        relative = self._headings - yaw
+        cos, sin = np.abs(np.cos(relative))[..., None], np.abs(np.sin(relative))[..., None]
         # Two rectangles are apart if they are apart along one of the four directions of their sides.
-        along_base = np.abs(_turned(away, np.array(-base.yaw))) - half - cos * self._half - sin * self._half[:, ::-1]
+        along_base = np.abs(_turned(away, -yaw)) - half - cos * self._half - sin * self._half[:, ::-1]
         along_outline = np.abs(_turned(away, -self._headings)) - self._half - cos * half - sin * half[::-1]
-        overlaps = (np.maximum(along_base, along_outline) < -_ROUNDING_M).all(axis=1)
-        return self._names[int(overlaps.argmax())] if overlaps.any() else None
+        return np.asarray((np.maximum(along_base, along_outline) < -_ROUNDING_M).all(axis=-1))
 
     def costmap(self, origin: Pose, *, distance_m: float, size_cells: int = 200, resolution_m: float = 0.02) -> Costmap:
         """Return a costmap of 1 where a cell's middle is at least this far from every outline, 0 elsewhere."""

@@ -24,9 +24,10 @@ from pycrorm_async.plan import (
     PlanFailure,
     Retry,
     TransportAction,
+    locations,
 )
 from pycrorm_async.plan.failures import ReachabilityFailure
-from pycrorm_async.plan.locations import Location, face
+from pycrorm_async.plan.locations import Location, PlaceReach, face
 from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.task_status import TaskStatus
@@ -119,7 +120,7 @@ async def test_a_policy_is_asked_with_async_for_and_says_so() -> None:
             policy().placing(thing, Arms.LEFT, Pose((0, 0, 3))).resolve()
 
 
-async def test_other_tasks_run_while_a_way_is_searched() -> None:
+async def test_other_tasks_run_while_a_way_or_a_place_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     turns = 0
 
     async def count_turns() -> None:
@@ -128,10 +129,21 @@ async def test_other_tasks_run_while_a_way_is_searched() -> None:
             await asyncio.sleep(0)
             turns += 1
 
+    def refuse(*_: Any, **__: Any) -> PlaceReach:
+        return PlaceReach(refusal="no")
+
     with tasks.kitchen(Disturbance()) as here:
-        thing, _ = here.prepare(69, 4)
+        thing, goal = here.prepare(69, 4)
+        way = await anext(policy(4).fetching(thing, ARMS, goal))
         counting = asyncio.create_task(count_turns())
-        assert [each async for each in policy().fetching(thing, ARMS, Pose((0, 0, 3)))] == []
+        monkeypatch.setattr(locations, "reaching_arms", refuse)
+        assert [each async for each in policy().fetching(thing, ARMS, goal)] == []
+        assert turns > 100
+        await way.perform()
+        turns = 0
+        transport = await TransportAction(thing, ARMS, [goal], policy=policy()).resolve()  # type: ignore[misc]
+        with pytest.raises(ReachabilityFailure, match="no other place to stand"):
+            await transport.perform()
         counting.cancel()
     assert turns > 100
 
@@ -156,7 +168,7 @@ async def test_where_nothing_is_remembered_recall_is_followed_by_the_model() -> 
 async def test_the_grasp_of_a_held_object_is_known_from_the_hand() -> None:
     grasps = set()
     with tasks.kitchen(Disturbance()) as here:
-        for number in SOLVABLE:
+        for number in (0, 20):
             thing, goal = here.prepare(69, number)
             way = await anext(policy(number).fetching(thing, ARMS, goal))
             await way.perform()

@@ -8,6 +8,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from pycrorm_async.world import (
     RobotDescription,
     copied,
 )
-from pycrorm_async.world.kinematics import Unreachable, chain_of, forward, solve, solve_from
+from pycrorm_async.world.kinematics import Unreachable, chain_of, forward, solve, solve_from, within_reach
 from pycrorm_async.world.models import built_in_model
 from pycrorm_async.world.pose import Arms, Grasp, Pose, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
@@ -241,6 +242,36 @@ def test_another_torso_height_has_the_solution_of_that_torso_and_nothing_moves()
         robot.set_joint_position("torso_lift_joint", 0.25)
         assert asked == solve(robot, Arms.LEFT, AHEAD)
         assert asked != solve(robot, Arms.LEFT, AHEAD, torso_height=0.0)
+
+
+@pytest.mark.parametrize(("name", "arm"), [("pr2", Arms.LEFT), ("pr2", Arms.RIGHT), ("courier", Arms.RIGHT)])
+@pytest.mark.parametrize("limits", Limits)
+def test_what_is_out_of_reach_has_no_solution_and_most_without_one_are_out_of_reach(
+    name: str, arm: Arms, limits: Limits
+) -> None:
+    rng = np.random.default_rng(7)
+    torsos = [None, 0.0, 0.33] if name == "pr2" else [None]
+    counts = {(may, solved): 0 for may in (True, False) for solved in (True, False)}
+    with BulletWorld():
+        robot = Object(name, ObjectType.ROBOT, pose=Pose([1, 2, 0], [0, 0, 1, 1]))
+        if name == "pr2":
+            robot.set_joint_position("torso_lift_joint", 0.2)
+        for _ in range(12):
+            goal = Pose(rng.uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.2]).tolist(), rng.normal(size=4).tolist())
+            at = rng.uniform(-1.1, 1.1, (10, 2)).tolist()
+            bases = [Pose((x, y, 0.0), yaw_quaternion(-math.atan2(y, -x))) for x, y in at]
+            reached = within_reach(robot, arm, [goal], bases=bases, torso_heights=torsos, limits=limits)
+            for may, (base, torso) in zip(reached.ravel(), product(bases, torsos), strict=True):
+                try:
+                    solve(robot, arm, goal, base=base, torso_height=torso, limits=limits)
+                    counts[bool(may), True] += 1
+                except Unreachable:
+                    counts[bool(may), False] += 1
+        both = within_reach(robot, arm, [goal, Pose([0, 0, 9])], bases=bases, torso_heights=torsos, limits=limits)
+        assert not both.any()
+    assert counts[False, True] == 0
+    assert counts[True, True] > 5
+    assert counts[False, False] > counts[True, False] / 2, counts
 
 
 # === chain ik =================================================================================================

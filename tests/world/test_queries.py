@@ -265,6 +265,19 @@ def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld
     assert min(counts) > 400
 
 
+def test_many_bases_are_clear_where_each_alone_is(world: BulletWorld) -> None:
+    rng = random.Random(4)
+    footprint = Footprint((-0.3, 0.5), (-0.2, 0.2))
+    assert Obstacles(world).clear(footprint, [Pose()]).tolist() == [True]
+    for n in range(3):
+        box(world, f"table {n}", Pose([rng.uniform(-2, 2), rng.uniform(-2, 2), 0], yaw_quaternion(rng.uniform(-3, 3))))
+    obstacles = Obstacles(world)
+    bases = [Pose([rng.uniform(-3, 3), rng.uniform(-3, 3), 0], yaw_quaternion(rng.uniform(-3, 3))) for _ in range(200)]
+    alone = [obstacles.overlapping(footprint, each) is None for each in bases]
+    assert obstacles.clear(footprint, bases).tolist() == alone
+    assert min(alone.count(True), alone.count(False)) > 30
+
+
 # === transparency =============================================================================================
 #
 # Transparent objects do not affect visibility: the same rays hit the same in a world without them.
