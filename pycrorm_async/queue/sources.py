@@ -400,7 +400,8 @@ def computed_ends(prefix: scan.ValidPrefix) -> tuple[Record, ...]:
 # The holder of `drain` reads; only the recorder deletes segments, after it reads in `progress` that they are stored. So
 # either process may be killed at any time. After a killed drainer the next one starts behind the visible position and
 # appends again what was stored and is not visible yet, which the log stores once. So it publishes the visibility of all
-# records for which a flush of the recorder may wait.
+# records for which a flush of the recorder may wait. If the recorder deletes stored segments meanwhile, reading raises
+# `SpoolUnavailable`, and the daemon takes the folder again.
 # After a killed recorder this source ends, and recovery supplies the whole folder again without regard to `progress`.
 
 _PAUSE_S_MIN = 0.002
@@ -477,7 +478,7 @@ class LiveSource:
             if last > self.supplied:
                 try:
                     with spool.wrap_os_errors(self.folder):
-                        batch = self._read(last=last, events_max=events_max, bytes_max=bytes_max)
+                        batch = self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
                 except (SpoolDamaged, SpoolUnavailable):
                     if self.is_alive:
                         raise
@@ -575,13 +576,6 @@ class LiveSource:
         self._alive_checked_s = now_s
         return not self.is_alive
 
-    def _read(self, *, last: int, events_max: int, bytes_max: int) -> spool_format.ReadBatch:
-        try:
-            return self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
-        except FileNotFoundError:  # the recorder has just deleted segments that an earlier drainer stored
-            self._reader.cursor = self._start_of(self.stored)
-            return self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
-
     def _update_note(self, **fields: object) -> None:
         status = self._status._replace(note=msgspec.structs.replace(self._status.note, **fields))
         if status != self._status:
@@ -597,11 +591,7 @@ class LiveSource:
         start: spool_format.ReadCursor | None = None
         for number in spool_format.segment_numbers(self.folder):
             path = spool_format.segment_path(self.folder, number)
-            try:
-                buffer = spool_format.map_segment(path)
-            except FileNotFoundError:  # stored and deleted since the listing
-                continue
-            with buffer:
+            with spool_format.map_segment(path) as buffer:
                 header = scan.read_header(path, buffer, recorder=self._recorder, number=number)
             if header is None or (start is not None and header.base - 1 > visible):
                 break

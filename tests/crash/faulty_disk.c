@@ -29,7 +29,7 @@
 
 static char root[4096], shadow[4096];
 static size_t root_size;
-static int lying, error_number, only_space;
+static int error_number, only_space;
 static long cut_at, fail_at, syncs, calls;
 static char failed[256];
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
@@ -126,7 +126,7 @@ static int sync_with(const char *name, int (*real)(int), int descriptor) {
     if (!shadow[0]) return real(descriptor);
     pthread_mutex_lock(&lock);
     if (++syncs == cut_at) kill(getpid(), SIGKILL);
-    if (!lying) keep(descriptor);
+    keep(descriptor);
     pthread_mutex_unlock(&lock);
     return 0;
 }
@@ -147,9 +147,9 @@ void disk_watch(const char *folder) {
     root_size = strlen(root);
 }
 
-void disk_cut_at(const char *copies, long n, int lies) {
+void disk_cut_at(const char *copies, long n) {
     snprintf(shadow, sizeof shadow, "%s", copies);
-    cut_at = n, lying = lies, syncs = 0;
+    cut_at = n, syncs = 0;
     int folder = syscall(SYS_openat, AT_FDCWD, root, O_RDONLY | O_DIRECTORY | O_CLOEXEC, 0);
     keep(folder);
     syscall(SYS_close, folder);

@@ -135,9 +135,9 @@ class FaultyDisk:
             each.mkdir(parents=True)
         self._identity = self.disk.stat().st_ino
 
-    def perform(self, *, cut: int = 0, lying: bool = False) -> Ended:
+    def perform(self, *, cut: int = 0) -> Ended:
         """Perform the plan on a disk that forgets; cut the power before the n-th sync, or when the plan has ended."""
-        return self._ended(self._process.call("perform", self._place / "lines", *self._paths, ["cut", cut, lying]))
+        return self._ended(self._process.call("perform", self._place / "lines", *self._paths, ["cut", cut, 0]))
 
     def perform_with_fault(self, n: int, *, number: int = errno.EIO) -> Ended:
         """Perform the plan on a disk whose n-th call fails with this error."""
@@ -227,7 +227,7 @@ def _run_with(folder: str, shadow: str, fault: list[Any], plan: Callable[[], Any
     disk.disk_watch(folder.encode())
     kind, n, value = fault
     if kind == "cut":
-        disk.disk_cut_at(shadow.encode(), n, int(value))
+        disk.disk_cut_at(shadow.encode(), n)
     else:
         disk.disk_fail_at(n, value, int(value == errno.ENOSPC))
     asyncio.run(plan())

@@ -7,7 +7,7 @@ import contextlib
 import os
 import random
 import shutil
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -108,17 +108,13 @@ async def drained(url: str, queue: Any) -> None:
     await log.close()
 
 
-def recover_all(url: str, spool: Path) -> None:
+def recover_all(url: str, spool: Path, _report: object = None) -> None:
     """Recover the spool as the next process does."""
     for folder in Spool(spool).recorders():
         recovered = open_dead(folder.path)
         if recovered is not None:
             asyncio.run(drained(url, recovered))
             recovered.release()
-
-
-def _recover_all(url: str, spool: Path, _report: object) -> None:
-    recover_all(url, spool)
 
 
 def stored(url: str, number: int) -> list[tuple[int, str, str]]:
@@ -186,11 +182,11 @@ def test_a_recovery_killed_at_any_step_and_again_in_the_next_one_stores_every_ev
         place = tmp_path_factory.mktemp("round")
         shutil.copytree(prepared, place, dirs_exist_ok=True)
         url, spool = f"sqlite:///{place}/memory.db", place / "spool"
-        done, _ = in_a_child(partial(_recover_all, url, spool), first, after=after)
+        done, _ = in_a_child(partial(recover_all, url, spool), first, after=after)
         if done and ended_at is None:
             ended_at = first
         if second:
-            in_a_child(partial(_recover_all, url, spool), second, after=not after)
+            in_a_child(partial(recover_all, url, spool), second, after=not after)
         recover_all(url, spool)
         complete(url)
         # A recovery that is killed after it deleted the last file may leave the folder, empty.
@@ -206,21 +202,20 @@ def test_a_recovery_killed_at_any_step_and_again_in_the_next_one_stores_every_ev
 # --- a recorder that is alive -----------------------------------------------------------------------------------------
 
 
-def record_and_drain(url: str, spool: Path, report: Callable[..., None]) -> None:
+def record_and_drain(url: str, spool: Path, payloads: Sequence[bytes], report: Callable[..., None]) -> None:
+    """Put these nodes into two episodes in turn, and both ends, while a task drains them."""
     queue = RecorderQueue.create(spool, settings=LIVE, clock=STILL, recorder=RECORDER)
 
     async def both() -> None:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-        settings = Settings(batch_events_max=4)
-        drain = asyncio.create_task(Drain(queue, log.append, settings=settings).run())
+        drain = asyncio.create_task(Drain(queue, log.append, settings=Settings(batch_events_max=4)).run())
         for number in (1, 2):
             report("put", number, queue.put_nowait(started(number), b"{}"))
-        for index in range(14):
-            payload = b'"%d %s"' % (index, b"y" * 900)
+        for index, payload in enumerate(payloads):
             report("put", 1 + index % 2, queue.put_nowait(node(1 + index % 2), payload))
             await queue.synced_to()
-            report("synced", queue.synced)
-        report("put", 1, queue.put_nowait(ended(1), b"{}"))
+        for number in (1, 2):
+            report("put", number, queue.put_nowait(ended(number), b"{}"))
         queue.close()
         with contextlib.suppress(DatabaseError):
             await drain
@@ -228,6 +223,9 @@ def record_and_drain(url: str, spool: Path, report: Callable[..., None]) -> None
 
     asyncio.run(both())
     queue.release()
+
+
+TEXTS = [b'"%d %s"' % (index, b"y" * 900) for index in range(14)]
 
 
 @pytest.mark.slow
@@ -244,15 +242,15 @@ def test_a_recorder_and_its_writer_killed_at_any_step_lose_no_event_that_was_put
         place.mkdir()
         url, spool = f"sqlite:///{place}/memory.db", place / "spool"
         shutil.copy(tmp_path / "made.db", place / "memory.db")
-        done, output = in_a_child(partial(record_and_drain, url, spool), step, after=after)
+        done, output = in_a_child(partial(record_and_drain, url, spool, TEXTS), step, after=after)
         recover_all(url, spool)
         for number in (1, 2):
             put = [int(line[2]) for line in output if line[:2] == ["put", str(number)]]
             rows = [row for row in stored(url, number) if row[2] != '{"status":"LOST"}']
             assert [row[0] for row in rows] == list(range(1, len(rows) + 1))
             assert len(put) <= len(rows) <= len(put) + 1, (step, after)
-            texts = ["{}", *(f'"{index} {"y" * 900}"' for index in range(number - 1, 14, 2)), "{}"]
-            assert [row[2] for row in rows] == texts[: len(rows)]
+            texts = [b"{}", *TEXTS[number - 1 :: 2], b"{}"]
+            assert [row[2].encode() for row in rows] == texts[: len(rows)]
         assert [path.parent.name for path in spool.glob("*/alive") if not path.parent.name.endswith(".making")] == []
     assert step > 40
 
@@ -265,36 +263,7 @@ NO_TEXT = b'"\xff"'  # no database stores it
 LOST = '{"status":"LOST"}'
 
 
-def record_and_drain_refused(url: str, spool: Path, report: Callable[..., None]) -> None:
-    queue = RecorderQueue.create(spool, settings=LIVE, clock=STILL, recorder=RECORDER)
-
-    async def both() -> None:
-        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-        task = asyncio.create_task(Drain(queue, log.append, settings=Settings(batch_events_max=4)).run())
-        for number in (1, 2):
-            report("put", number, queue.put_nowait(started(number), b"{}"))
-        for index in range(6):
-            payload = NO_TEXT if index == 2 else b'"%d %s"' % (index, b"y" * 900)
-            report("put", 1 + index % 2, queue.put_nowait(node(1 + index % 2), payload))
-            await queue.synced_to()
-        for number in (1, 2):
-            report("put", number, queue.put_nowait(ended(number), b"{}"))
-        queue.close()
-        with contextlib.suppress(DatabaseError):
-            await task
-        await log.close()
-
-    asyncio.run(both())
-    queue.release()
-
-
-def recover(url: str, spool: Path, _report: object) -> None:
-    """Recover the spool as the next process does."""
-    for folder in Spool(spool).recorders():
-        recovered = open_dead(folder.path)
-        if recovered is not None:
-            asyncio.run(drained(url, recovered))
-            recovered.release()
+REFUSED_TEXTS = [*TEXTS[:2], NO_TEXT, *TEXTS[3:6]]
 
 
 def dead_letter(spool: Path) -> list[Record]:
@@ -323,18 +292,11 @@ def test_a_kill_at_any_step_and_again_neither_loses_nor_doubles_an_event_of_a_re
         place.mkdir()
         url, spool = f"sqlite:///{place}/memory.db", place / "spool"
         asyncio.run(_made(url))
-        done, lines = in_a_child(partial(record_and_drain_refused, url, spool), step, after=after)
-        in_a_child(partial(recover, url, spool), 1 + step * 7 % 30, after=not after)
+        done, lines = in_a_child(partial(record_and_drain, url, spool, REFUSED_TEXTS), step, after=after)
+        in_a_child(partial(recover_all, url, spool), 1 + step * 7 % 30, after=not after)
         for _ in range(2):  # a part that is refused a second time is not written again
-            recover(url, spool, None)
-        texts = {
-            number: [
-                b"{}",
-                *(NO_TEXT if each == 2 else b'"%d %s"' % (each, b"y" * 900) for each in range(number - 1, 6, 2)),
-                b"{}",
-            ]
-            for number in (1, 2)
-        }
+            recover_all(url, spool)
+        texts = {number: [b"{}", *REFUSED_TEXTS[number - 1 :: 2], b"{}"] for number in (1, 2)}
         stored_by_episode = {number: {row[0]: row[2].encode() for row in stored(url, number)} for number in (1, 2)}
         aside = dead_letter(spool)
         sequences = [each.sequence for each in aside]

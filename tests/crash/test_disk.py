@@ -19,7 +19,6 @@ from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.codec import Record, is_computed_end
 from pycrorm_async.events.types import references_in
 from pycrorm_async.queue import RecorderQueue, blobs, open_dead
-from pycrorm_async.queue import format as queue_format
 from pycrorm_async.queue.blobs import is_whole
 from pycrorm_async.queue.format import EVENT, Segment, salt_of
 from pycrorm_async.settings import Settings
@@ -260,24 +259,6 @@ def blob_machine(tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> 
 async def test_a_record_that_survives_a_power_cut_has_its_blob_and_a_synced_one_survives(
     blob_machine: BlobMachine, seed: int
 ) -> None:
-    await survive_cuts_with_blobs(blob_machine, seed)
-
-
-FORGOTTEN_BLOBS = {"the sync of a blob": "_sync_file", "the sync of a blob's name": "sync_folder"}
-
-
-@pytest.mark.parametrize("forgotten", FORGOTTEN_BLOBS)
-async def test_the_power_cuts_are_noticed_by_blobs_that_forget(
-    tmp_path: Path, forgotten: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(blobs, FORGOTTEN_BLOBS[forgotten], lambda path: None)
-    rng = random.Random(0)
-    with pytest.raises(AssertionError), machine_on(tmp_path, rng) as machine:
-        await survive_cuts_with_blobs(BlobMachine(machine, rng, monkeypatch), 0)
-
-
-async def survive_cuts_with_blobs(blob_machine: BlobMachine, seed: int) -> None:
-    """Run the recorder, and look for the blob of each record that a power cut left."""
     rng, machine = random.Random(seed + 3000), blob_machine.machine
     machine.put(started(1), b"{}")
     machine.put(started(2), b"{}")
@@ -350,11 +331,6 @@ def machine(tmp_path: Path, seed: int) -> Iterator[Machine]:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (0, *range(2, 200)))])
 async def test_a_power_cut_costs_no_synced_record_and_is_never_reported_as_damage(machine: Machine, seed: int) -> None:
-    await survive_cuts(machine, seed)
-
-
-async def survive_cuts(machine: Machine, seed: int) -> None:
-    """Run the recorder, and compare what each power cut left with what had been put and reported as synced."""
     rng = random.Random(seed + 1000)
     await live_through_cuts(machine, rng)
 
@@ -373,21 +349,6 @@ async def survive_cuts(machine: Machine, seed: int) -> None:
             spoil(folder, synced)
             with pytest.raises(SpoolDamaged):
                 await recover(folder)
-
-
-FORGOTTEN = {
-    "a sync of a segment": (Segment, "sync", lambda segment: None),
-    "the sync of a new segment's name": (queue_format, "sync_folder", lambda folder: None),
-}
-
-
-@pytest.mark.parametrize("forgotten", FORGOTTEN)
-async def test_the_power_cuts_are_noticed_by_a_queue_that_forgets(
-    tmp_path: Path, forgotten: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(*FORGOTTEN[forgotten])
-    with pytest.raises((AssertionError, SpoolDamaged)), machine_on(tmp_path, random.Random(1)) as machine:
-        await survive_cuts(machine, 1)
 
 
 @pytest.mark.slow

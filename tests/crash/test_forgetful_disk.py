@@ -44,11 +44,3 @@ def test_a_power_cut_after_the_end_takes_nothing(process: DiskProcess, tmp_path:
     assert (ended.code, ended.steps("stored"), ended.refusals) == (0, ALL, [])
     disk.cut_power()
     assert disk.found() == (ALL, [])
-
-
-def test_a_power_cut_takes_everything_if_no_sync_does_anything(process: DiskProcess, tmp_path: Path) -> None:
-    disk = FaultyDisk(process, tmp_path)
-    ended = disk.perform(lying=True)
-    assert (ended.steps("stored"), ended.syncs > 40) == (ALL, True)
-    disk.cut_power()
-    assert disk.found() == (set(), [])

@@ -73,36 +73,12 @@ async def test_a_rebuild_killed_anywhere_changes_nothing_readers_see_and_the_nex
     await kill_again_and_again(database_url, 2, workers=1)
 
 
-@pytest.mark.soak  # above without workers; operations/test_workers: they end with a process that is killed
-async def test_a_rebuild_with_workers_killed_anywhere_changes_nothing_readers_see(tmp_path: Path) -> None:
-    await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 1, workers=2)
-
-
 @pytest.mark.soak
 @pytest.mark.parametrize("workers", [1, 2])
 async def test_a_rebuild_killed_at_fifty_points_changes_nothing_readers_see(
     database_url: str, workers: int, in_turn: bool
 ) -> None:
     await kill_again_and_again(database_url, 8 if in_turn else 50, workers=workers)
-
-
-@pytest.mark.soak  # projections/test_rebuild kills workers that have folded something
-async def test_a_killed_worker_costs_time_and_no_event(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from multiprocessing.context import SpawnProcess
-
-    await filled(database_url)
-    before = tables_of(database_url)
-    original = SpawnProcess.start
-
-    def start(self: SpawnProcess) -> None:
-        original(self)
-        self.kill()
-
-    monkeypatch.setattr(SpawnProcess, "start", start)
-    monkeypatch.setattr(rebuilding, "_SHARE_EVENTS_MIN", 1)
-    done = await rebuild_memory(database_url, workers=2)
-    assert (done.generation, done.left) == (1002, [])
-    assert differences(before, tables_of(database_url)) == []
 
 
 async def rebuild_beside_recorders(

@@ -21,7 +21,6 @@ from typing import NoReturn
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract, PlanFailure
-from tests.golden.make import _without_owner
 
 __all__ = ["ZOO", "PourActionPerformable"]
 
@@ -64,6 +63,12 @@ def main(archive: Path) -> None:
         with tarfile.open(archive, "w:gz") as packed:
             for path in sorted(Path(folder).iterdir()):
                 packed.add(path, path.name, filter=_without_owner)
+
+
+def _without_owner(member: tarfile.TarInfo) -> tarfile.TarInfo:
+    member.uid = member.gid = member.mtime = 0
+    member.uname = member.gname = ""
+    return member
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Newer programs continue the memory of an older one: the recipes of the README, on the golden memory.
 
-`tests/golden/make.py` wrote the golden memory; the expected content is written here by hand.
+Version 0.1.0 wrote the golden memory; the expected content is written here by hand.
 """
 
 from __future__ import annotations

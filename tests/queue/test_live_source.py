@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
+from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.format import segment_numbers, segment_path
@@ -173,7 +173,9 @@ async def test_a_waiting_producer_learns_why_nothing_more_is_stored_and_waits_ag
     source.release()
 
 
-async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage(spool: Path, tmp_path: Path) -> None:
+async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage_and_is_taken_again(
+    spool: Path, tmp_path: Path
+) -> None:
     """The recorder deletes the oldest segments while the next drainer reads the first one."""
     queue = make(spool, offered=True)
     for number in range(60):
@@ -181,25 +183,27 @@ async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage
     await queue.synced_to()
     folder = crashed_copy(queue, tmp_path / "other")  # no recorder deletes anything here by itself
     queue.release()
-    alive = FileLock.take(folder / ALIVE)
-    progress = Progress.open(folder, writing=True)
+    alive, numbers = FileLock.take(folder / ALIVE), segment_numbers(folder)
     assert alive is not None
-    assert progress is not None
-    progress.write_drain_status(DrainStatus(stored=60, folded=0))
-    progress.close()
-    numbers = segment_numbers(folder)
     assert len(numbers) > 4
-    source = LiveSource.take(folder)
-    assert source is not None
+
+    def take_again() -> LiveSource:
+        source = LiveSource.take(folder)
+        assert source is not None
+        return source
+
+    source = take_again()
     assert await next_positions(source, events_max=1) == [1]
     for each in numbers[:2]:
         segment_path(folder, each).unlink()
-    supplied = await next_positions(source, events_max=100)
-    assert supplied[-1] == 60
+    with pytest.raises(SpoolUnavailable, match="No such file"):
+        await next_positions(source, events_max=100)
+    source.release()
+    source = take_again()
+    assert (await next_positions(source, events_max=100))[-1] == 60
     source.release()
     segment_path(folder, numbers[3]).unlink()  # an older one is still there
-    source = LiveSource.take(folder)
-    assert source is not None
+    source = take_again()
     with pytest.raises(SpoolDamaged, match="is missing"):
         await next_positions(source, events_max=100)
     source.release()

@@ -227,7 +227,7 @@ def test_a_newer_format_is_refused_and_nothing_is_changed(author: FolderWriter) 
 
 
 @pytest.fixture
-def no_writer_alive() -> Iterator[Path]:
+def read_only_folder() -> Iterator[Path]:
     """A folder that this process cannot write to during the test."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
@@ -238,8 +238,8 @@ def no_writer_alive() -> Iterator[Path]:
         Path(folder).chmod(0o755)
 
 
-def test_a_folder_without_write_permission_is_reported_in_one_line_and_stays_as_it_is(no_writer_alive: Path) -> None:
-    author = FolderWriter(no_writer_alive)
+def test_a_folder_without_write_permission_is_reported_in_one_line_and_stays_as_it_is(read_only_folder: Path) -> None:
+    author = FolderWriter(read_only_folder)
     for heading in (started(), node(), node()):
         author.put(heading)
     author.sync()
@@ -248,7 +248,7 @@ def test_a_folder_without_write_permission_is_reported_in_one_line_and_stays_as_
     for path in (author.folder / "alive", *author.segments):
         path.chmod(0o666)
     author.folder.chmod(0o777)
-    no_writer_alive.chmod(0o555)
+    read_only_folder.chmod(0o555)
     if os.geteuid() == 0:
         os.seteuid(65534)
     with pytest.raises(SpoolUnavailable, match="Permission denied") as refused:
