@@ -24,10 +24,8 @@ from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.pose import DescriptionNotLoadable
 from pycrorm_async.world.urdf_model import UrdfFault, read_model, urdf_text
 
-_KNOWN_MAX = 1_000
-"""Bounds the descriptions kept, because a program may generate any number. When it is reached all are dropped."""
 _KNOWN_CHARACTERS_MAX = 2**24
-"""Bounds the characters of the descriptions kept."""
+"""Bounds the characters of the descriptions kept, because a program may generate any number; then all are dropped."""
 _REASON_MAX = 500
 """Bounds the characters of the reason why a description or a mesh is missing."""
 _HEADING = Heading(None, DescriptionDeclared.__name__, DescriptionDeclared.version)
@@ -146,7 +144,7 @@ class Descriptions:
 
     def _declare(self, described: Described) -> str:
         text = described.description_text
-        if len(self._known) >= _KNOWN_MAX or self._known_characters > _KNOWN_CHARACTERS_MAX:
+        if self._known_characters > _KNOWN_CHARACTERS_MAX:
             self._files.clear()
             self._known.clear()
             self._known_characters = 0

@@ -23,6 +23,7 @@ import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import partial, wraps
 from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
@@ -167,7 +168,7 @@ class Recorder:
         self.episodes = recording.episodes
         self._strict = emitter.settings.on_unrecordable == "refuse"
         self._declarations = Declarations(recording.known_types, strict=self._strict)
-        self._sampler = _sampler_of(emitter)
+        self._sampler = Sampler(emitter) if emitter.settings.sample_interval_ms is not None else None
         self._kept: set[tuple[str, str]] = set()
         self._pose_fields: dict[type, tuple[tuple[str, int], ...]] = {}
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "__dtype__", "it")))
@@ -445,13 +446,7 @@ def observing() -> Recorder | None:
     return observer if isinstance(observer, Recorder) else None
 
 
-def _sampler_of(emitter: episode_writer.Emitter) -> Sampler | None:
-    settings = emitter.settings
-    if settings.sample_interval_ms is None:
-        return None
-    return Sampler(emitter, interval_ms=settings.sample_interval_ms, change_min=settings.sample_change_min)
-
-
+@dataclass
 class _SimulationRecord:
     """The hooks' record of a running simulation.
 
@@ -461,10 +456,9 @@ class _SimulationRecord:
         episode: the simulation's own episode; None if it could not start.
     """
 
-    def __init__(self, node: event_types.NodeReference | None, outer_episode: Episode | None) -> None:
-        self.node = node
-        self.outer_episode = outer_episode
-        self.episode: Episode | None = None
+    node: event_types.NodeReference | None
+    outer_episode: Episode | None
+    episode: Episode | None = None
 
 
 def _simulating_node(simulation: Simulation | None) -> event_types.NodeReference | None:
@@ -758,10 +752,12 @@ class Sampler:
         omitted: number of samples not written because the spool or the episode had no room.
     """
 
-    def __init__(self, emitter: episode_writer.Emitter, *, interval_ms: int, change_min: float) -> None:
+    def __init__(self, emitter: episode_writer.Emitter) -> None:
+        settings = emitter.settings
+        assert settings.sample_interval_ms is not None, "None samples nothing"
         self._emitter = emitter
-        self._interval_s = interval_ms / 1000
-        self._change_min = change_min
+        self._interval_s = settings.sample_interval_ms / 1000
+        self._change_min = settings.sample_change_min
         # The garbage collector may call `end` in a thread that holds the lock; a plain lock would deadlock there. Plans
         # use the lock itself, because Ctrl-C inside the condition's `__enter__`, a Python function, leaves it taken.
         self._lock = threading.RLock()

@@ -208,27 +208,15 @@ def _bases(designator: type[Performable]) -> tuple[str, ...]:
 def _aliases_or_fault(
     designator: type[Performable], classes_by_alias: Mapping[str, weakref.ref[type]]
 ) -> tuple[tuple[str, ...], str | None]:
-    """Return the aliases of a class; if one of them is not allowed, return no aliases and the reason."""
-    try:
-        aliases = _aliases(designator)
-    except DeclarationRefused as refused:
-        return (), refused.reason
-    fault = _conflict(designator, classes_by_alias, aliases, _ALIAS_IN_USE)
-    return (aliases, None) if fault is None else ((), fault)
-
-
-def _aliases(designator: type[Performable]) -> tuple[str, ...]:
-    """Read the former names of this type; a subclass does not inherit them."""
+    """Return the former names of a type, which a subclass does not inherit; none if one is not allowed, and why."""
     aliases = designator.__aliases__
     if not isinstance(aliases, tuple | list) or not all(isinstance(each, str) for each in aliases):
-        raise DeclarationRefused(
-            _path(designator), f"its aliases {aliases!r} are not a tuple of names such as ('OldAction',)"
-        )
+        return (), f"its aliases {aliases!r} are not a tuple of names such as ('OldAction',)"
     for each in aliases:
-        fault = _fault_in_alias(each, designator)
-        if fault is not None:
-            raise DeclarationRefused(_path(designator), f"its alias {each!r} {fault}")
-    return tuple(aliases)
+        if (fault := _fault_in_alias(each, designator)) is not None:
+            return (), f"its alias {each!r} {fault}"
+    fault = _conflict(designator, classes_by_alias, aliases, _ALIAS_IN_USE)
+    return (tuple(aliases), None) if fault is None else ((), fault)
 
 
 def _fault_in_alias(alias: str, designator: type[Performable]) -> str | None:

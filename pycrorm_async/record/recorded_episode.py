@@ -1,5 +1,7 @@
 """A `RecordedEpisode` is an episode of an executive that is not ours: any thread writes nodes, objects and values."""
 
+# ruff: noqa: ARG002  `reported` reads the argument `at` of each method
+
 from __future__ import annotations
 
 import functools
@@ -28,11 +30,13 @@ from pycrorm_async.record.values import PoseLike, clean_repr, encode_or_missing
 
 
 def reported(
-    event_type: str,
+    event_type: str, *, timed: bool = True
 ) -> Callable[
     [Callable[Concatenate[RecordedEpisode, P], Callable[[], object]]], Callable[Concatenate[RecordedEpisode, P], None]
 ]:
     """Make a method that copies its arguments, and returns the call that writes them, one that writes and never raises.
+
+    With `timed`, the events happen at its argument `at`.
 
     Its exceptions are counted. If the memory is closed or belongs to a parent process, only the call is counted; the
     memory has ended what was open then, so an end is not missed.
@@ -44,8 +48,9 @@ def reported(
         @functools.wraps(method)
         def run(self: RecordedEpisode, /, *args: P.args, **kwargs: P.kwargs) -> None:
             if self.is_recording(method.__name__, event_type):
+                at: Any = kwargs.get("at") if timed else None
                 try:
-                    self._writer.write(event_type, method(self, *args, **kwargs))
+                    self._writer.write(event_type, method(self, *args, **kwargs), at)
                 except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
                     self.emitter.note_fault(event_type, error)
 
@@ -261,18 +266,7 @@ class RecordedEpisode:
         own, lower = self._checked_status(status), self._checked_status(below) if below is not None else None
         value = noted(self.emitter, "NodeEnded", self._values.failure, failure, writer) if failure is not None else None
         encoded = encode_or_missing(self._values.converted(result), writer) if result is not None else None
-        return self._timed("NodeEnded", at, lambda: writer.end_node(key, own, value, encoded, lower, untimed=untimed))
-
-    def _timed(self, event_type: str, at: At | None, write: Callable[[], object]) -> Callable[[], object]:
-        """Return a call that writes events of a given time."""
-        if at is None:
-            return write
-
-        def timed() -> object:
-            self._writer.set_time(event_type, at)
-            return write()
-
-        return timed
+        return lambda: writer.end_node(key, own, value, encoded, lower, untimed=untimed)
 
     def _checked_status(self, status: event_types.NodeStatus) -> event_types.NodeStatus:
         if status in END_STATUSES:
@@ -325,7 +319,7 @@ class RecordedEpisode:
             name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
             base_link=base_link, torso_joint=torso_joint,
         )  # fmt: skip
-        return self._timed("ObjectAdded", at, lambda: self._writer.objects.add(key, added, self._writer.cause(node)))
+        return lambda: self._writer.objects.add(key, added, self._writer.cause(node))
 
     @reported("ObjectMoved")
     def object_moved(
@@ -341,9 +335,7 @@ class RecordedEpisode:
         if not writer.closed and writer.objects.is_at(key, pose):
             return lambda: None  # before the pose is copied, which takes longer
         copied = pose_of(pose)
-        return self._timed(
-            "ObjectMoved", at, lambda: writer.objects.move(writer.known(key), copied, writer.cause(node))
-        )
+        return lambda: writer.objects.move(writer.known(key), copied, writer.cause(node))
 
     @reported("a frame")
     def frame_moved(self, frame: str, pose: PoseLike | event_types.PoseValue) -> Callable[[], object]:
@@ -361,9 +353,7 @@ class RecordedEpisode:
     ) -> Callable[[], object]:
         """Record new joint positions (rad or m); only those that changed."""
         copied, writer = self._arguments.joints_of(joints, "JointsMoved"), self._writer
-        return self._timed(
-            "JointsMoved", at, lambda: writer.objects.turn(writer.known(key), copied, writer.cause(node))
-        )
+        return lambda: writer.objects.turn(writer.known(key), copied, writer.cause(node))
 
     @reported("ObjectAttached")
     def object_attached(
@@ -377,11 +367,7 @@ class RecordedEpisode:
     ) -> Callable[[], object]:
         """Record that `child` moves with `link` of `parent` from now on."""
         name, writer = self._arguments.text_of("link", link), self._writer
-
-        def write() -> int:
-            return writer.objects.attach(writer.known(parent), writer.known(child), name, writer.cause(node))
-
-        return self._timed("ObjectAttached", at, write)
+        return lambda: writer.objects.attach(writer.known(parent), writer.known(child), name, writer.cause(node))
 
     @reported("ObjectDetached")
     def object_detached(
@@ -389,11 +375,7 @@ class RecordedEpisode:
     ) -> Callable[[], object]:
         """Record that `child` no longer moves with `parent`."""
         writer = self._writer
-
-        def write() -> int:
-            return writer.objects.detach(writer.known(parent), writer.known(child), writer.cause(node))
-
-        return self._timed("ObjectDetached", at, write)
+        return lambda: writer.objects.detach(writer.known(parent), writer.known(child), writer.cause(node))
 
     @reported("ObjectRemoved")
     def object_removed(
@@ -401,7 +383,7 @@ class RecordedEpisode:
     ) -> Callable[[], object]:
         """Record that an object left the world."""
         writer = self._writer
-        return self._timed("ObjectRemoved", at, lambda: writer.objects.remove(writer.known(key), writer.cause(node)))
+        return lambda: writer.objects.remove(writer.known(key), writer.cause(node))
 
     def reference(self, key: Hashable) -> event_types.ObjectReference | None:
         """Return the current row of an object, for values that name it; None if there is none of this key.
@@ -418,7 +400,7 @@ class RecordedEpisode:
     ) -> Callable[[], object]:
         """Record an observation; `Memory.observe` describes name and values."""
         copied = self._values.converted(values)
-        return self._timed("Observed", at, lambda: self._writer.observe(name, copied, node))
+        return lambda: self._writer.observe(name, copied, node)
 
     def observe_camera(
         self, name: str, frames: Any = None, *, hz: float = 2.0, bytes_per_s: float = 4e6, node: Hashable | None = None
@@ -438,7 +420,7 @@ class RecordedEpisode:
         stream = CameraStream(name, record, self.emitter, self._episodes.clock, hz, bytes_per_s)
         return stream if frames is None else stream.read(frames)
 
-    @reported("Observed")
+    @reported("Observed", timed=False)
     def sampled(
         self,
         key: Hashable,
@@ -483,15 +465,13 @@ class RecordedEpisode:
         copied = (noted(self.emitter, "ObjectDetected", struct_of, each, event_types.SeenValue) for each in seen)
         percepts = [replace(each, pose=event_types.BriefPose.of(each.pose)) for each in copied if each is not None]
         event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
-
-        return self._timed("ObjectDetected", at, lambda: self._writer.detect(event, percepts, node))
+        return lambda: self._writer.detect(event, percepts, node)
 
     @reported("EpisodeTagged")
     def tag(self, *tags: str, remove: Sequence[str] = (), at: At | None = None) -> Callable[[], object]:
         """Add and remove tags."""
         added, removed = checked_tags(tags), checked_tags(remove)
-
-        return self._timed("EpisodeTagged", at, lambda: EpisodeWriter.change_tags(self._writer, added, removed))
+        return lambda: EpisodeWriter.change_tags(self._writer, added, removed)
 
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
         """Block while the spool is full, for a limited time; return whether it has room now.

@@ -310,7 +310,7 @@ def _encode_member(value: Any, enum: type[Enum] | None, references: References) 
     if not isinstance(name, str):
         raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {type(value).__name__}")
     writable: str = _require_writable(name)
-    return writable if type(writable) is str else str(writable)
+    return writable
 
 
 def _encode_pose(value: Any, _enum: type[Enum] | None, references: References) -> event_types.PoseValue:

@@ -65,7 +65,7 @@ async def assert_intact(url: str, *, behind: int = 0) -> None:
 @pytest.mark.slow
 @pytest.mark.soak_on("postgresql")
 async def test_tags_change_during_and_after_an_episode_and_survive_copy_and_rebuild(
-    database_url: str, tmp_path: Path, server: Server
+    database_url: str, tmp_path: Path
 ) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="one", tags=["kitchen", "night"], metadata={"batch": 7}) as one:
@@ -94,18 +94,12 @@ async def test_tags_change_during_and_after_an_episode_and_survive_copy_and_rebu
     before = tables_of(database_url)
     await rebuild_memory(database_url)
     assert differences(before, tables_of(database_url)) == []
-    other = f"sqlite:///{tmp_path}/copy.db" if database_url.startswith("postgresql") else server.new_database()
+    other = f"sqlite:///{tmp_path}/copy.db"
     await copy_episodes(database_url, other)
-    async with Reading.open(other) as reading:
-        assert await tags_of(reading) == {"one": ["good", "late"], "two": ["second"]}
-    log = await EventLog.open(DatabaseAddress.parse(other), create=False)
-    assert all(each.ended_wall_ns is not None for each in await log.episodes())
-    await log.close()
-    await assert_intact(other)
     await tag_episode(DatabaseAddress.parse(other), "1", ("in the copy",), ())
+    async with Reading.open(other) as reading:
+        assert await tags_of(reading) == {"one": ["good", "late", "in the copy"], "two": ["second"]}
     await assert_intact(other)
-    if other.startswith("postgresql"):
-        server.drop(other)
 
 
 @pytest.mark.slow
