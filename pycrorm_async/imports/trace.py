@@ -80,13 +80,15 @@ def read_trace(path: Path, settings: TraceMap, intake: Intake) -> None:
     """Give the episodes of a trace file to the intake. Raises `WrongFormat`."""
     if path.is_dir():
         raise intakes.WrongFormat(f"{path} is a folder: name the trace files in it")
-    document, offset = _parsed(path, _uncompressed(path))
+    content, cut = _uncompressed(path)
+    document, offset = _parsed(path, content)
     if "traceEvents" in document:
         _read_events(path, document, settings, intake)
     else:
         _read_otlp(path, document["lines"], settings, intake)
-    if offset is not None:
-        intake.cut(path, f"ends in the middle of a record, at byte {offset:,}; what stands before is imported")
+    if offset is not None or cut:
+        where = f"byte {offset:,}" if offset is not None and not cut else "the end of what can be decompressed"
+        intake.cut(path, f"ends in the middle of a record, at {where}; what stands before is imported")
 
 
 FORMAT = intakes.ImportFormat(
@@ -96,12 +98,18 @@ FORMAT = intakes.ImportFormat(
 # === files ====================================================================================================
 
 
-def _uncompressed(path: Path) -> bytes:
+def _uncompressed(path: Path) -> tuple[bytes, bool]:
+    """Return the content of a file, and whether its compressed part ends too early."""
     content = path.read_bytes()
+    if not content.startswith(b"\x1f\x8b"):
+        return content, False
     try:
-        return gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise intakes.WrongFormat(f"{path} cannot be decompressed: {error}; give a whole copy") from None
+        return gzip.decompress(content), False
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        try:
+            return zlib.decompressobj(wbits=31).decompress(content), True
+        except zlib.error as error:
+            raise intakes.WrongFormat(f"{path} is compressed, but not readable as gzip: {error}") from None
 
 
 def _parsed(path: Path, content: bytes) -> tuple[Mapping[str, Any], int | None]:
