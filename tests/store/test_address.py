@@ -16,21 +16,29 @@ def database_url(tmp_path: Path) -> str:
     return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
-def test_three_slashes_name_a_file_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_three_slashes_name_a_file_in_the_working_directory_and_four_one_by_its_absolute_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     address = DatabaseAddress.parse("sqlite:///memory.db")
     monkeypatch.chdir("/")
-    assert address.path == tmp_path / "memory.db"
-    assert address.default_spool == tmp_path / "memory.db.spool"
-
-
-def test_four_slashes_name_a_file_by_its_absolute_path() -> None:
+    assert (address.path, address.default_spool) == (tmp_path / "memory.db", tmp_path / "memory.db.spool")
     address = DatabaseAddress.parse("sqlite:////data/lab 1/memory.db")
-    assert address.path == Path("/data/lab 1/memory.db")
-    assert address.default_spool == Path("/data/lab 1/memory.db.spool")
+    assert (address.path, address.is_sqlite, address.is_private) == (Path("/data/lab 1/memory.db"), True, False)
     assert str(address) == "sqlite:////data/lab 1/memory.db"
-    assert address.is_sqlite
-    assert not address.is_private
+
+
+async def test_a_path_may_contain_characters_that_a_url_must_escape_and_others_are_shown(tmp_path: Path) -> None:
+    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/Ümläute 50%25 of%3F a #memory.db")
+    assert address.path == tmp_path / "Ümläute 50% of? a #memory.db"
+    assert str(address) == f"sqlite:///{tmp_path}/Ümläute 50%25 of%3F a %23memory.db"
+    assert DatabaseAddress.parse(str(address)).path == address.path
+    address.path.touch()
+    engine = address.engine()
+    async with engine.begin() as connection:
+        await connection.execute(text("CREATE TABLE t (a)"))
+    await engine.dispose()
+    assert address.path.read_bytes()[:15] == b"SQLite format 3"
 
 
 def test_no_text_of_an_address_contains_the_password() -> None:
@@ -94,23 +102,6 @@ async def test_an_engine_never_makes_a_missing_file(tmp_path: Path) -> None:
                 pass
         await engine.dispose()
     assert not address.path.exists()
-
-
-def test_letters_beyond_ascii_are_shown_as_they_are_and_signs_of_a_url_are_not(tmp_path: Path) -> None:
-    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/Ümläute 50%25 #.db")
-    assert str(address) == f"sqlite:///{tmp_path}/Ümläute 50%25 %23.db"
-    assert DatabaseAddress.parse(str(address)).path == address.path
-
-
-async def test_a_path_may_contain_characters_that_a_url_must_escape(tmp_path: Path) -> None:
-    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/50%25 of%3F a #memory.db")
-    assert address.path == tmp_path / "50% of? a #memory.db"
-    address.path.touch()
-    engine = address.engine()
-    async with engine.begin() as connection:
-        await connection.execute(text("CREATE TABLE t (a)"))
-    await engine.dispose()
-    assert address.path.read_bytes()[:15] == b"SQLite format 3"
 
 
 async def test_a_commit_waits_for_the_disk_and_a_reader_cannot_write(address: DatabaseAddress) -> None:

@@ -36,6 +36,7 @@ async def test_every_column_is_stored_as_it_was_appended(log: EventLog, database
     assert ask(database_url, "SELECT * FROM event ORDER BY episode, sequence") == [
         (1, each.sequence, "ObjectAdded", 3, each.wall_ns, each.monotonic_ns, each.payload.decode()) for each in records
     ]
+    assert [tuple(each) for each in await log.events(1, after=1)] == [(1, *each[2:]) for each in records[1:]]
 
 
 PAYLOADS = [
@@ -65,6 +66,7 @@ async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: Even
     assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(9), 40), (2, name(3), 42), (3, name(5), 1)]
     counts = ask(database_url, "SELECT count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY 1")
     assert counts == [(1, 1, 1), (40, 1, 40), (42, 1, 42)]
+    assert [await log.episode_number(episode(each)) for each in (3, 8)] == [2, None]
     assert episode_text(episode(9)) == name(9)
 
 
@@ -78,69 +80,45 @@ async def test_an_episode_row_has_the_times_of_its_start_and_end(log: EventLog, 
     assert ask(database_url, HEADS) == [(1, name(1), 4, 0, 100, 300, None, None)]
 
 
-async def test_an_empty_batch_opens_no_transaction(file_log: EventLog) -> None:
-    holder = sqlite3.connect(file_log.address.path, isolation_level=None)
-    holder.execute("BEGIN IMMEDIATE")
-    assert await file_log.append([]) == {}
-    holder.close()
-
-
 # --- repeated batches -------------------------------------------------------------------------------------------------
 
 
-async def test_a_batch_appended_twice_is_stored_once(log: EventLog, database_url: str) -> None:
+async def test_of_a_batch_that_repeats_or_overlaps_stored_events_the_new_ones_are_stored(
+    log: EventLog, database_url: str
+) -> None:
     records = [declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 5), *run_of(episode(2), 1, 3)]
-    await log.append(records)
-    before = ask(database_url, "SELECT * FROM event ORDER BY episode, sequence"), ask(database_url, HEADS)
-    assert await log.append(records) == {}
-    assert (ask(database_url, "SELECT * FROM event ORDER BY episode, sequence"), ask(database_url, HEADS)) == before
-    assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
-
-
-async def test_a_batch_that_overlaps_stored_events_adds_the_new_ones(log: EventLog, database_url: str) -> None:
-    await log.append(run_of(episode(1), 1, 5))
+    for _ in range(2):
+        assert await log.append(records) == {}
+        assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 5), (2, name(2), 3)]
+        assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
     assert await log.append([*run_of(episode(1), 3, 8), *run_of(episode(1), 7, 9)]) == {}
-    assert ask(database_url, "SELECT sequence FROM event ORDER BY sequence") == [(n,) for n in range(1, 10)]
-    assert ask(database_url, "SELECT head FROM episode") == [(9,)]
+    sequences = ask(database_url, "SELECT sequence FROM event WHERE episode = 1 ORDER BY sequence")
+    assert sequences == [(n,) for n in range(1, 10)]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"payload": b'{"kind":"motion"}'},
-        {"payload": b'{"kind":"action","parent":2} '},
-        {"kind": "NodeEnded"},
-        {"version": 2},
-        {"wall_ns": 1},
-        {"monotonic_ns": 1},
-    ],
-)
-async def test_a_different_event_under_a_stored_number_is_damage_and_stores_nothing(
-    log: EventLog, database_url: str, change: dict[str, bytes]
+async def test_a_different_event_under_a_used_number_or_event_zero_is_damage_and_stores_nothing(
+    log: EventLog, database_url: str
 ) -> None:
     await log.append(run_of(episode(1), 1, 3))
     before = ask(database_url, "SELECT * FROM event ORDER BY episode, sequence")
-    with pytest.raises(LogDamaged) as caught:
-        await log.append(
-            [
-                *run_of(episode(2), 1, 4),
-                record(episode(1), 2, **change),  # type: ignore[arg-type]
-                *run_of(episode(1), 3, 6),
-            ]
-        )
-    assert (caught.value.episode, caught.value.sequence) == (name(1), 2)
-    assert ask(database_url, "SELECT * FROM event ORDER BY episode, sequence") == before
-    assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 3)]
-
-
-@pytest.mark.parametrize("sequence", [0, 3])
-async def test_a_different_event_under_a_number_of_the_same_batch_and_event_zero_are_damage(
-    log: EventLog, database_url: str, sequence: int
-) -> None:
-    with pytest.raises(LogDamaged) as caught:
-        await log.append([*run_of(episode(1), 1, 3), record(episode(1), sequence, payload=b"{}")])
-    assert (caught.value.episode, caught.value.sequence) == (name(1), sequence)
-    assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
+    second = record(episode(1), 2)
+    others = [
+        second._replace(payload=b'{"kind":"motion"}'),
+        second._replace(payload=second.payload + b" "),
+        second._replace(type="NodeEnded"),
+        second._replace(version=2),
+        second._replace(wall_ns=1),
+        second._replace(monotonic_ns=1),
+        record(episode(1), 0),
+    ]
+    batches = [[*run_of(episode(2), 1, 4), each, *run_of(episode(1), 3, 6)] for each in others]
+    batches.append([*run_of(episode(1), 4, 6), record(episode(1), 5, payload=b"{}")])  # twice in one batch
+    for batch, sequence in zip(batches, (2, 2, 2, 2, 2, 2, 0, 5), strict=True):
+        with pytest.raises(LogDamaged) as caught:
+            await log.append(batch)
+        assert (caught.value.episode, caught.value.sequence) == (name(1), sequence)
+        assert ask(database_url, "SELECT * FROM event ORDER BY episode, sequence") == before
+        assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 3)]
 
 
 # --- declarations ---------------------------------------------------------------------------------------------
@@ -214,14 +192,15 @@ async def test_a_log_replaced_by_garbage_is_reported_as_a_fault_of_the_system(fi
         await file_log.events(1)
 
 
-@pytest.mark.parametrize("with_new", [True, False])
-@pytest.mark.parametrize("meanwhile", ["nothing", "the same", "a part of it", "folded", "refused", "other"])
+@pytest.mark.parametrize(
+    "meanwhile", ["nothing", "the same", "a part of it", "folded", "refused", "other", "different"]
+)
 async def test_values_prepared_before_the_transaction_are_prepared_again_if_the_episode_has_changed(
-    file_log: EventLog, meanwhile: str, with_new: bool
+    file_log: EventLog, meanwhile: str
 ) -> None:
     log, file = file_log, file_log.address.path  # PostgreSQL appends without preparing
     await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 1)])
-    batch = [*run_of(episode(1), 3, 9), *run_of(episode(2), 2, 4), *run_of(episode(3), 1, 2 if with_new else 0)]
+    batch = [*run_of(episode(1), 3, 9), *run_of(episode(2), 2, 4), *run_of(episode(3), 1, 2)]
     appending = Appending(dialect_of(log.engine), batch)
     async with log.reading() as connection:
         await appending.prepare(connection)
@@ -229,18 +208,24 @@ async def test_values_prepared_before_the_transaction_are_prepared_again_if_the_
         case "the same":
             await log.append(batch)
         case "a part of it":
-            await log.append([*run_of(episode(1), 4, 6), *run_of(episode(3), 1, 1 if with_new else 0)])
+            await log.append([*run_of(episode(1), 4, 6), *run_of(episode(3), 1, 1)])
         case "folded":
             ask_to_change(file, "UPDATE episode SET folded = 2 WHERE number = 1")
         case "refused":
             await log.append(run_of(episode(2), 9, 9))
         case "other":
             await log.append([record(episode(4), 1), record(episode(1), 4)])
+        case "different":
+            await log.append([record(episode(1), 4, payload=b"{}")])
+            with pytest.raises(LogDamaged):
+                async with log.writing() as connection:
+                    await appending.write(connection)
+            return
     async with log.writing() as connection:
         assert (await appending.write(connection)).refusals == {}
     numbers = {1: 1, 2: 2, 3: 4, 4: 3} if meanwhile == "other" else {1: 1, 2: 2, 3: 3}
     stored = ask(file, "SELECT episode, sequence, payload FROM event ORDER BY episode, sequence")
-    expected = {1: 9, 2: 4} | ({3: 2} if with_new else {}) | ({4: 1} if meanwhile == "other" else {})
+    expected = {1: 9, 2: 4, 3: 2} | ({4: 1} if meanwhile == "other" else {})
     assert stored == sorted(
         (numbers[of], sequence, f'{{"kind":"action","parent":{sequence}}}')
         for of, last in expected.items()
@@ -249,21 +234,6 @@ async def test_values_prepared_before_the_transaction_are_prepared_again_if_the_
     assert [row[:1] + row[2:4] + row[6:7] for row in ask(file, HEADS)] == sorted(
         (numbers[of], last, 2 if (meanwhile, of) == ("folded", 1) else 0, None) for of, last in expected.items()
     )
-
-
-async def test_a_different_event_under_a_key_that_was_free_before_the_transaction_is_damage(
-    file_log: EventLog,
-) -> None:
-    log = file_log
-    await log.append(run_of(episode(1), 1, 3))
-    appending = Appending(dialect_of(log.engine), run_of(episode(1), 4, 6))
-    async with log.reading() as connection:
-        await appending.prepare(connection)
-    await log.append([record(episode(1), 4, payload=b"{}")])
-    with pytest.raises(LogDamaged):
-        async with log.writing() as connection:
-            await appending.write(connection)
-    assert ask(log.address.path, "SELECT sequence, payload FROM event WHERE sequence > 3") == [(4, "{}")]
 
 
 # === multi row insert =========================================================================================
@@ -301,8 +271,7 @@ def any_rows(count: int, *, empty_often: float) -> list[tuple[Any, ...]]:
     return rows
 
 
-@pytest.mark.parametrize("empty_often", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("count", [1, 63, 64, 65, 300, 5_000])
+@pytest.mark.parametrize(("count", "empty_often"), [(1, 0.5), (65, 0.0), (300, 1.0), (5_000, 0.5)])
 async def test_inserted_and_updated_rows_hold_the_values_that_were_passed(
     file_log: EventLog, count: int, empty_often: float
 ) -> None:
@@ -371,7 +340,7 @@ async def test_a_gap_stops_its_episode_and_no_other(
     assert [(row.id, row.refused) for row in await log.stopped()] == ([] if kept is None else [(name(1), kept)])
 
 
-@pytest.mark.parametrize("payload", [b'{"name":"a\x00b"}', b'{"name":"\xff"}', b'{"name":"\xc3', b'"\xed\xa0\x80"'])
+@pytest.mark.parametrize("payload", [b'{"name":"a\x00b"}', b'"\xed\xa0\x80"'])
 async def test_text_that_no_database_can_hold_stops_its_episode(
     log: EventLog, database_url: str, payload: bytes
 ) -> None:

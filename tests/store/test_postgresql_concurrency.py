@@ -14,7 +14,7 @@ from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask
-from tests.store.factories import declaration, episode, run_of, started
+from tests.store.factories import episode, run_of, started
 
 pytestmark = pytest.mark.slow
 
@@ -39,34 +39,6 @@ async def test_two_concurrent_appends_of_one_episode_store_it_once(database_url:
     assert ask(database_url, "SELECT number, head, refused FROM episode")[0][1:] == (400, None)
     for each in logs:
         await each.close()
-
-
-@pytest.mark.soak
-async def test_sixteen_concurrent_appends_of_different_episodes_lose_nothing_and_share_no_number(
-    database_url: str,
-) -> None:
-    address = DatabaseAddress.parse(database_url)
-
-    async def robot(number: int) -> None:
-        log = await EventLog.open(address, create=True, busy_timeout_s=30.0)
-        try:
-            for round_ in range(5):
-                mine = 100 * number + round_
-                await log.append([declaration(b'{"dtype":"%d"}' % (mine % 7)), *run_of(episode(mine), 1, 50)])
-                await log.append([*run_of(episode(mine), 51, 80), *run_of(episode(mine + 50), 1, 3)])
-        finally:
-            await log.close()
-
-    async with asyncio.TaskGroup() as robots:
-        for number in range(1, 17):
-            robots.create_task(robot(number))
-    rows = ask(database_url, "SELECT id, number, head FROM episode")
-    assert len(rows) == 16 * 10
-    assert len({number for _, number, _ in rows}) == 160
-    assert sorted(head for *_, head in rows) == [3] * 80 + [80] * 80
-    counted = ask(database_url, "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY 1")
-    assert {(number, head, 1, head) for _, number, head in rows} == set(counted)
-    assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(7,)]
 
 
 async def test_an_append_waits_for_a_row_that_another_session_locks_and_then_the_database_is_unavailable(

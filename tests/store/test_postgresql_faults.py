@@ -153,22 +153,6 @@ async def test_a_connection_that_fails_repeatedly_costs_no_event(fault: str, pro
     verify_stored_once(direct_url, records, drain, source)
 
 
-async def test_a_lost_reply_to_every_commit_stores_everything_once(proxy: Proxy, direct_url: str) -> None:
-    records = records_of_three_episodes(random.Random(8), 1500)
-    address = url_through_proxy(proxy, direct_url)
-    log = await EventLog.open(address, create=True)
-    for first in range(0, len(records), 100):
-        proxy.swallow_reply_to(b"COMMIT")
-        with pytest.raises(DatabaseUnavailable):
-            await log.append(records[first : first + 100])
-        # The transaction was committed, and is not repeated.
-        assert stored(direct_url) == expected(records[: first + 100])
-        assert await log.append(records[first : first + 100]) == {}
-    await log.close()
-    assert proxy.faults == 15
-    assert stored(direct_url) == expected(records)
-
-
 async def test_a_batch_cut_at_any_byte_is_stored_whole_or_not_at_all(proxy: Proxy, direct_url: str) -> None:
     address = url_through_proxy(proxy, direct_url)
     log = await EventLog.open(address, create=True)
@@ -188,22 +172,6 @@ async def test_a_batch_cut_at_any_byte_is_stored_whole_or_not_at_all(proxy: Prox
     assert stored_events > 0
     assert proxy.faults > 20
     await log.close()
-
-
-async def test_a_server_that_refuses_every_connection_is_unavailable_until_it_accepts_one(
-    proxy: Proxy, direct_url: str
-) -> None:
-    records = records_of_three_episodes(random.Random(12), 1000)
-
-    async def refusing(drain: Drain) -> None:
-        proxy.refuse()
-        proxy.cut()
-        await until(lambda: drain.state.retries >= 5)
-        assert drain.state.unavailable is not None
-        proxy.refuse(refusing=False)
-
-    drain, source = await drained(url_through_proxy(proxy, direct_url), records, refusing)
-    verify_stored_once(direct_url, records, drain, source)
 
 
 async def test_a_silent_connection_is_closed_and_the_batch_is_sent_through_another(
