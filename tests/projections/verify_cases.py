@@ -274,11 +274,6 @@ def visible_tables(url: str) -> list[VisibleTable]:
     return list(tables.values())
 
 
-def named(url: str, table: str) -> str:
-    """Return the table behind this visible name in SQL."""
-    return next(each.physical for each in visible_tables(url) if each.name == table)
-
-
 def literal(value: Any, kind: str) -> str:
     """Return the value as SQL text."""
     if value is None:

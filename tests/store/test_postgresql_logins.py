@@ -71,51 +71,48 @@ async def test_a_password_with_any_characters_opens_the_database(server: Server,
     await log.close()
 
 
-@pytest.mark.parametrize("password", ["s3cr-wrong", ""])
-async def test_a_wrong_password_is_refused(
-    server: Server, guarded: str, password: str, caplog: pytest.LogCaptureFixture
+async def test_a_login_a_database_or_a_server_that_is_wrong_is_named_with_what_to_do(
+    server: Server, guarded: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    error = await refused(server.url(guarded, user="guarded", password=password), caplog)
-    assert type(error) is DatabaseUnavailable
-    how = "put the right password into PYCRORM_URL or ~/.pgpass"
-    assert str(error).endswith(f'password authentication failed for user "guarded": {how}')
-    assert f"@/{guarded}?host={server.folder}: " in str(error)
-
-
-async def test_an_unknown_login_or_one_without_permission_is_refused(
-    server: Server, caplog: pytest.LogCaptureFixture
-) -> None:
-    error = await refused(server.url(user="stranger", password="s3cr"), caplog)
-    how = "correct the user in the URL, or let the server's administrator create or admit it"
-    assert str(error).endswith(f'role "stranger" does not exist: {how}')
-    error = await refused(server.url(user="pg_monitor", password="s3cr"), caplog)
-    assert str(error).endswith(f'role "pg_monitor" is not permitted to log in: {how}')
-
-
-@pytest.mark.parametrize("create", [True, False])
-async def test_a_missing_database_is_refused(server: Server, create: bool, caplog: pytest.LogCaptureFixture) -> None:
-    error = await refused(server.url("nothing", password="s3cr"), caplog, create=create)
-    assert type(error) is DatabaseUnavailable
-    assert str(error).endswith('database "nothing" does not exist: create it with `createdb`, or correct the URL')
+    admit = "correct the user in the URL, or let the server's administrator create or admit it"
+    unlocked = "put the right password into PYCRORM_URL or ~/.pgpass"
+    full = urlsplit(server.new_database()).path.removeprefix("/")
+    ask(server.url(), f"ALTER DATABASE {full} CONNECTION LIMIT 0")
+    ask(server.url(), "CREATE ROLE guest LOGIN")
+    for url, reason in (
+        (server.url(user="stranger", password="s3cr"), f'role "stranger" does not exist: {admit}'),
+        (server.url(user="pg_monitor", password="s3cr"), f'role "pg_monitor" is not permitted to log in: {admit}'),
+        (
+            server.url(guarded, user="guarded", password="s3cr-wrong"),
+            f'password authentication failed for user "guarded": {unlocked}',
+        ),
+        (
+            server.url(guarded, user="guarded", password=""),
+            f'password authentication failed for user "guarded": {unlocked}',
+        ),
+        (
+            server.url("nothing", password="s3cr"),
+            'database "nothing" does not exist: create it with `createdb`, or correct the URL',
+        ),
+        (server.url(full, user="guest"), f'too many connections for database "{full}"'),
+        ("postgresql://ada:s3cr@/memory?host=/tmp/no/server", "cannot be reached: No such file or directory"),
+        (
+            "postgresql://ada:s3cr@127.0.0.1:1/memory",
+            "cannot be reached: Connection refused: start the server, or correct the URL",
+        ),
+    ):
+        for create in (True, False):
+            error = await refused(url, caplog, create=create)
+            assert type(error) is DatabaseUnavailable
+            assert str(error).endswith(reason)
+            assert str(error).startswith("postgresql://")
+    error = await refused("postgresql://ada:s3cr@no-such-host.invalid/memory", caplog)
+    assert str(error).startswith("postgresql://ada:***@no-such-host.invalid/memory: cannot be reached: ")
 
 
 @pytest.mark.parametrize(
-    ("place", "reason"),
-    [
-        ("postgresql://ada:s3cr@/memory?host=/tmp/no/server", "cannot be reached: No such file or directory"),
-        ("postgresql://ada:s3cr@127.0.0.1:1/memory", "cannot be reached: Connection refused"),
-        ("postgresql://ada:s3cr@no-such-host.invalid/memory", "no-such-host.invalid/memory: cannot be reached: "),
-    ],
+    ("answer", "parameters"), [(b"HTTP/1.1 400 Bad Request\r\n\r\n", ""), (b"", "?sslmode=require")]
 )
-async def test_a_missing_server_is_refused(place: str, reason: str, caplog: pytest.LogCaptureFixture) -> None:
-    error = await refused(place, caplog)
-    assert type(error) is DatabaseUnavailable
-    assert reason in str(error)
-    assert str(error).startswith("postgresql://ada:***@")
-
-
-@pytest.mark.parametrize("parameters", ["", "?sslmode=require"])
-@pytest.mark.parametrize("answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b""])
 async def test_another_program_at_the_port_is_refused(
     caplog: pytest.LogCaptureFixture, answer: bytes, parameters: str
 ) -> None:
@@ -173,30 +170,17 @@ async def test_a_login_without_rights_is_refused(
         assert str(error).endswith(f"permission denied for schema pycrorm: {advice}")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("create", [True, False])
-async def test_a_schema_of_another_program_is_left_alone(
-    server: Server, create: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_schema_of_another_program_is_left_alone(server: Server, caplog: pytest.LogCaptureFixture) -> None:
     url = server.new_database()
     ask(url, "CREATE SCHEMA pycrorm")
     ask(url, "CREATE TABLE pycrorm.bookmarks (url text)")
-    error = await refused(url, caplog, create=create)
-    assert type(error) is DatabaseForeign
-    assert str(error).endswith("has a schema 'pycrorm' of another program: it has no pycrorm_log")
+    for create in (True, False):
+        error = await refused(url, caplog, create=create)
+        assert type(error) is DatabaseForeign
+        assert str(error).endswith("has a schema 'pycrorm' of another program: it has no pycrorm_log")
     assert ask(url, "SELECT relname FROM pg_class WHERE relnamespace = 'pycrorm'::regnamespace AND relkind = 'r'") == [
         ("bookmarks",)
     ]
-
-
-async def test_a_server_without_free_connections_is_refused(server: Server, caplog: pytest.LogCaptureFixture) -> None:
-    url = server.new_database()
-    database = urlsplit(url).path.removeprefix("/")
-    ask(server.url(), f"ALTER DATABASE {database} CONNECTION LIMIT 0")
-    ask(server.url(), "CREATE ROLE guest LOGIN")
-    error = await refused(server.url(database, user="guest"), caplog)
-    assert type(error) is DatabaseUnavailable
-    assert str(error).endswith(f'too many connections for database "{database}"')
 
 
 # === tls ======================================================================================================
@@ -279,7 +263,6 @@ async def opened(url: str) -> None:
     ("host", "parameters", "asks", "refused"),
     [
         ("localhost", "sslmode=require", False, None),
-        ("localhost", "sslmode=prefer", False, None),
         ("localhost", "sslmode=verify-full&sslrootcert={}/ca.crt", False, None),
         ("127.0.0.1", "sslmode=verify-ca&sslrootcert={}/ca.crt", False, None),
         (
@@ -302,7 +285,6 @@ async def opened(url: str) -> None:
             "sslrootcert of the database's URL cannot be read",
         ),
         ("localhost", "sslmode=require", True, ""),
-        ("localhost", "sslmode=disable", False, ""),
     ],
 )
 async def test_a_connection_is_encrypted_and_verified_as_the_url_demands(

@@ -23,7 +23,7 @@ from tests.databases import Server, ask, ask_to_change, change_each
 from tests.store.factories import episode, record, run_of
 
 
-async def test_the_list_of_unfolded_episodes_shrinks_as_they_are_folded_once_and_up_to_their_head(
+async def test_the_list_of_unfolded_episodes_shrinks_as_they_are_folded(
     log: EventLog,
 ) -> None:
     await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 2)])
