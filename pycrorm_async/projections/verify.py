@@ -327,8 +327,6 @@ _PART_EVENTS = 4_000
 """The events of a part, unless one episode has more: the memory that verify uses grows with the longest episode."""
 _PAGE_EVENTS = 4_000
 """Bounds the events that are read at once."""
-_ATTEMPTS = 10
-"""Bounds the snapshots for one part while rebuilds replace the tables."""
 
 _BY_PREFIX = "SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5)"
 _FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")
@@ -402,32 +400,24 @@ async def _check_part(
     log: EventLog, within: findings.EpisodeRange, checks: Sequence[findings.TableCheck], result: findings.VerifyResult
 ) -> findings.EpisodeRange | None:
     """Check the next whole episodes in one snapshot; return the range that is left. Raises `DatabaseForeign`."""
-    missing = ""
-    for _ in range(_ATTEMPTS):
-        async with log.snapshot() as connection:
-            limits = {**within.limits, "limit": _PART_EVENTS}
-            episodes = await dialect_of(connection).rows(
-                connection, stored.EpisodeRow, schema.SELECT_EPISODES, **limits
-            )
-            episodes, left = _first_part(episodes, within)
-            part = within if left is None else findings.EpisodeRange(within.first, left.first)
-            for check in checks:
-                if not await check.begin(connection, part, episodes):
-                    missing = check.missing_table
-                    break
-            else:
-                result.episodes += len(episodes)
-                await _read_part(log, connection, episodes, checks, result)
-                for check in checks:
-                    try:
-                        with log.translated():
-                            async with connection.begin_nested():
-                                await check.compare(connection)
-                    except DamageError as fault:
-                        result.add_damage(None, None, str(fault))
-                return left
-        # A rebuild replaced and dropped the tables between two statements: read the generation again.
-    raise DatabaseForeign(f"{log.address}: {missing}")
+    async with log.snapshot() as connection:
+        limits = {**within.limits, "limit": _PART_EVENTS}
+        episodes = await dialect_of(connection).rows(connection, stored.EpisodeRow, schema.SELECT_EPISODES, **limits)
+        episodes, left = _first_part(episodes, within)
+        part = within if left is None else findings.EpisodeRange(within.first, left.first)
+        for check in checks:
+            if not await check.begin(connection, part, episodes):
+                raise DatabaseForeign(f"{log.address}: {check.missing_table}")
+        result.episodes += len(episodes)
+        await _read_part(log, connection, episodes, checks, result)
+        for check in checks:
+            try:
+                with log.translated():
+                    async with connection.begin_nested():
+                        await check.compare(connection)
+            except DamageError as fault:
+                result.add_damage(None, None, str(fault))
+    return left
 
 
 def _first_part(
@@ -575,7 +565,7 @@ async def _check_heads(log: EventLog, within: findings.EpisodeRange, result: fin
 class _TablesCheck:
     """The check of the log and of the built-in tables. Implements `TableCheck`."""
 
-    missing_table = "a table is missing: run `pycrorm rebuild`"
+    missing_table = "a table is missing: run `pycrorm rebuild`, or verify again if one has just ended"
 
     def __init__(self, log: EventLog, result: findings.VerifyResult) -> None:
         self._log = log
@@ -702,7 +692,8 @@ class ProjectionCheck:
         self._projection = projection
         self.result = result
         name = projection.name
-        self.missing_table = f"a table of the projection {name} is missing: run `pycrorm rebuild {name}`"
+        advice = f"run `pycrorm rebuild {name}`, or verify again if one has just ended"
+        self.missing_table = f"a table of the projection {name} is missing: {advice}"
         self._comparison: findings.Comparison | None = None
         self._part = findings.EpisodeRange()
         self._folded: dict[int, int] = {}

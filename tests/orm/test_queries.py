@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
@@ -117,10 +117,39 @@ async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -
     )
 
 
-async def test_the_version_of_an_episode_has_the_name_from_the_thesis_as_a_synonym(breakfast: EventLog) -> None:
-    (metadata,) = await every(breakfast, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
-    assert metadata.pycram_version == metadata.version == "1.0"
-    assert await every(breakfast, select(ProcessMetaData.pycram_version)) == ["1.0"]
+async def test_rows_are_joined_along_their_relationships_and_names_of_the_thesis(breakfast: EventLog) -> None:
+    async with session_on(breakfast) as session:
+        for question, rows in (
+            (select(ProcessMetaData.pycram_version).where(ProcessMetaData.pycram_version == "1.0"), [("1.0",)]),
+            (
+                select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode),
+                [("Tutorial", 3.0)],
+            ),
+            (
+                select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == "LEFT"),
+                [(Arms.LEFT, TaskStatus.FAILED)],
+            ),
+            (
+                select(TaskTreeNode.id)
+                .join(TaskTreeNode.action.of_type(PickUpAction))
+                .where(PickUpAction.arm == Arms.LEFT),
+                [(row(11),)],
+            ),
+            (
+                select(Position.x, Quaternion.z)
+                .select_from(NavigateAction)
+                .join(NavigateAction.robot_state)
+                .join(RobotState.pose)
+                .join(Pose.position)
+                .join(Pose.orientation),
+                [(0.5, 0.6)],
+            ),
+            *(  # the pose of the object at execution, and not after it has moved
+                (select(Pose.x, Pose.z).join(picked).join(Object.pose), [(1.0, 3.0)])
+                for picked in (PickUpAction.object, PickUpAction.object_designator)
+            ),
+        ):
+            assert list(map(tuple, await session.execute(question))) == rows
 
 
 async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) -> None:
@@ -163,12 +192,6 @@ async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog)
         "NavigateAction", "MoveMotion", "PickUpAction", "OpenAction", "MoveJointsMotion",
     ]  # fmt: skip
     assert designators[0].target_location.position.x == 7.0
-
-
-async def test_the_pose_of_a_picked_up_object_is_the_one_at_execution(breakfast: EventLog) -> None:
-    for picked in (PickUpAction.object, PickUpAction.object_designator):
-        poses = await every(breakfast, select(Pose).join(picked).join(Object.pose))
-        assert [(each.position.x, each.position.y, each.position.z) for each in poses] == [(1.0, 2.0, 3.0)]
 
 
 async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: EventLog) -> None:
@@ -225,29 +248,6 @@ async def test_an_attribute_that_is_not_loaded_names_the_remedy(
     (closed,) = await every(breakfast, select(class_).where(class_.id == row(sequence)))  # type: ignore[attr-defined]
     with pytest.raises(CallerError, match=message):
         getattr(closed, name)
-
-
-async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
-    question = (
-        select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == Arms.LEFT)
-    )
-    async with session_on(breakfast) as session:
-        assert (await session.execute(question)).all() == [(Arms.LEFT, TaskStatus.FAILED)]
-        other = select(TaskTreeNode).join(TaskTreeNode.action.of_type(PickUpAction)).where(PickUpAction.arm == "LEFT")
-        assert [each.id for each in await session.scalars(other)] == [row(11)]
-
-
-async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
-    question = (
-        select(Position.x, Quaternion.z)
-        .select_from(NavigateAction)
-        .join(NavigateAction.robot_state)
-        .join(RobotState.pose)
-        .join(Pose.position)
-        .join(Pose.orientation)
-    )
-    async with session_on(breakfast) as session:
-        assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
 async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakfast: EventLog) -> None:
@@ -310,18 +310,6 @@ async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: Event
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
 
 
-async def test_a_row_has_its_event_and_queries_filter_and_order_by_it(breakfast: EventLog) -> None:
-    nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
-    assert [each.sequence for each in nodes] == sorted((each.sequence for each in nodes), reverse=True)
-    assert all(each.id == row(each.sequence) for each in nodes)
-    assert await every(breakfast, select(Action.id).where(Action.sequence == 6)) == [row(6)]
-    ends = {each.sequence: each.end_sequence for each in nodes}
-    assert await every(breakfast, select(Action.end_sequence).where(Action.sequence == 6)) == [ends[6]]
-    for class_ in (Object, Pose, Attachment, JointChange, ObjectRemoval, RootFailure, PickUpAction):
-        (sequences,) = (await every(breakfast, select(func.sum(class_.sequence)))) or [None]
-        assert sequences == sum(each.sequence for each in await every(breakfast, select(class_))) > 0, class_
-
-
 # === action attributes ========================================================================================
 #
 # Actions have their node, their times and their outcome, also in filters and in plain SQL.
@@ -338,50 +326,34 @@ class ORMWait(Action):
     status: Mapped[str]  # type: ignore[assignment]
 
 
-async def test_an_action_has_its_times_and_its_outcome(breakfast: EventLog) -> None:
+async def test_an_action_has_its_times_and_its_outcome_also_in_filters(breakfast: EventLog) -> None:
     drive, pick, opening = await every(breakfast, select(Action).order_by(Action.start_time))
     assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
     assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
     assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
     assert (opening.status, opening.end_time, opening.duration) == (TaskStatus.LOST, None, None)
     assert pick.episode is pick.process_metadata
-    (move,) = await every(breakfast, select(MoveMotion))
-    assert (move.status, move.duration) == (TaskStatus.SUCCEEDED, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("condition", "expected"),
-    [
+    for condition, sequences in (
         (Action.status == TaskStatus.FAILED, [11]),
         (Action.duration >= 3, [6, 11]),
         (Action.end_time.is_(None), [15]),
         (Action.start_time > moment(6), [11, 15]),
         (Action.reason == "IKError", [11]),
         (Action.episode.has(description="Tutorial"), [6, 11, 15]),
-    ],
-)
-async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
-    breakfast: EventLog, condition: Any, expected: list[int]
-) -> None:
-    slowest_last = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
-    assert await every(breakfast, slowest_last) == [row(each) for each in expected]
+        (Action.sequence == 6, [6]),
+    ):
+        in_order = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
+        assert await every(breakfast, in_order) == [row(each) for each in sequences]
 
 
-async def test_an_action_joins_its_episode(breakfast: EventLog) -> None:
-    question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
-    async with session_on(breakfast) as session:
-        assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
-
-
-@pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
-async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(breakfast: EventLog, view: str) -> None:
-    columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
-    course = await ask(
-        breakfast, f"SELECT {columns} FROM {view} WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id"
-    )
+async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(breakfast: EventLog) -> None:
     move = (1, "MoveMotion", "SUCCEEDED", time_us(8), time_us(9), 1.0, None)
     pick = (1, "PickUpAction", "FAILED", time_us(11), time_us(14), 3.0, "IKError")
-    assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
+    columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
+    chosen = "WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id"
+    views = {"action": [pick], "motion": [move], "designator": [move, pick], "task_tree_node": [move, pick]}
+    for view, rows in views.items():
+        assert await ask(breakfast, f"SELECT {columns} FROM {view} {chosen}") == rows
 
 
 async def test_a_field_with_the_name_of_an_action_attribute_hides_it(log: EventLog) -> None:
@@ -434,15 +406,7 @@ async def filled(log: EventLog) -> EventLog:
     return log
 
 
-async def test_a_mapped_row_has_its_event_and_queries_order_by_it(filled: EventLog) -> None:
-    async with session_on(filled) as session:
-        for class_, event in EVENTS.items():
-            assert list(await session.scalars(select(func.max(class_.sequence)))) == [event], class_
-            loaded = (await session.scalars(select(class_).order_by(class_.sequence))).all()
-            assert {each.sequence for each in loaded} == {event}, class_
-
-
-async def test_every_view_of_what_happened_has_the_event_of_its_rows(filled: EventLog) -> None:
+async def test_every_view_and_class_of_what_happened_has_the_event_of_its_rows(filled: EventLog) -> None:
     tables = {mapper.class_.__tablename__: mapper.class_ for mapper in Base.registry.mappers}
     async with filled.engine.connect() as connection:
         generation = await current_generation(connection)
@@ -457,10 +421,10 @@ async def test_every_view_of_what_happened_has_the_event_of_its_rows(filled: Eve
             for row in answer.mappings():
                 # A field of a type that has this name takes precedence.
                 assert row["sequence"] == (70 if view == "set_action" else row_key(row[key]).sequence), view
+    async with session_on(filled) as session:
         for class_, event in EVENTS.items():
-            table = class_.__tablename__
-            sequences = await connection.exec_driver_sql(f'SELECT DISTINCT sequence FROM "{table}"')
-            assert sequences.scalars().all() == [event], table
+            loaded = (await session.scalars(select(class_).order_by(class_.sequence))).all()
+            assert {each.sequence for each in loaded} == {event}, class_
 
 
 # === failures =================================================================================================
@@ -537,17 +501,6 @@ async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: Ev
     assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)
 
 
-async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
-    note = declared("NoteAction", "note_action", field("lines", "dict", 2, item="text"))
-    script = Script()
-    lines = {"object": "milk", "row": "first"}
-    node = script.put(NodeStarted("action", None, name_of(note), {"lines": lines}))
-    script.put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
-    await stored_and_folded(log, [*declarations(note), *script.records])
-    (failure,) = await every(log, select(RootFailure))
-    assert (failure.path, failure.object, failure.recovered) == ("NoteAction", None, False)
-
-
 async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
     script = failing()
     for place, each in enumerate(script.records[:-3]):  # the second episode has none
@@ -561,13 +514,3 @@ async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventL
         async with reading.session(simulated=also) as session:
             counts.append(len((await session.scalars(select(RootFailure))).all()))
     assert counts == [1, 4]
-
-
-async def test_plain_sql_counts_where_failures_began(log: EventLog) -> None:
-    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
-    question = "SELECT path, object, count(*) FROM root_failure GROUP BY path, object ORDER BY path"
-    assert await ask(log, question) == [
-        ("root", None, 1),
-        ("root > OpenAction", "handle", 1),
-        ("root > Retry > PickUpAction > MoveMotion", "milk", 2),
-    ]

@@ -119,14 +119,13 @@ async def rebuilt(log: EventLog) -> None:
         await clear(log)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak), pytest.param(3, marks=pytest.mark.soak)])
 async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
-    log: EventLog, monkeypatch: pytest.MonkeyPatch, seed: int, *, in_turn: bool
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(custom, "_EPISODES_MAX", 3)
     monkeypatch.setattr(custom, "_PAGE_EVENTS", 4)
-    random = Random(seed)
-    episodes = random_episodes(random, 24 if seed == 1 or in_turn else 200)
+    random = Random(1)
+    episodes = random_episodes(random, 24)
     scripts = [episode(number, tries, ends=number % 3 != 0) for number, tries in enumerate(episodes, 1)]
     records = [each for first in range(0, len(scripts), 5) for each in mixed(*scripts[first : first + 5])]
     await log.append([*declarations(PICK_UP), *records[:1]])
@@ -150,40 +149,22 @@ async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
     assert await rows_in(log) == rows
 
 
-async def test_after_a_restart_only_open_episodes_are_read_again(log: EventLog) -> None:
-    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
-    await log.append([*declarations(PICK_UP), *episode(1, tries).records, *episode(2, tries).records[:5]])
-    await (await projector_of(log)).catch_up()
-    await log.append(episode(2, tries).records)
-    Attempts.read.clear()
-    await (await projector_of(log)).catch_up()
-    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
-    assert Attempts.read == Counter({f"2/{sequence}": 1 for sequence in range(1, 9)})
-
-
-async def test_a_process_reads_an_event_of_an_open_episode_once(log: EventLog) -> None:
+async def test_a_process_reads_an_event_once_and_after_a_restart_those_of_open_episodes_again(log: EventLog) -> None:
     tries = [("LEFT", "FAILED"), ("RIGHT", "SUCCEEDED"), ("LEFT", "SUCCEEDED")]
+    ended, still_open = episode(1, tries).records, episode(2, tries, ends=False).records
     await log.append(declarations(PICK_UP))
-    projector = await projector_of(log)
     Attempts.read.clear()
-    for each in episode(1, tries, ends=False).records:
+    projector = await projector_of(log)
+    for each in (*ended, *still_open[:6]):
         await log.append([each])
         await projector.catch_up()
-    assert await rows_in(log) == expected(1, tries, ends=False)
-    assert Attempts.read == Counter({f"1/{sequence}": 1 for sequence in range(1, 9)})
-
-
-async def test_workers_in_turn_read_an_event_of_an_episode_once_that_is_a_little_longer_than_its_share(
-    log: EventLog,
-) -> None:
-    tries = [("LEFT", "FAILED")] * 510
-    await log.append([*declarations(PICK_UP), *(each for n in range(1, 23) for each in episode(n, tries).records)])
+    once = [*(f"1/{each.sequence}" for each in ended), *(f"2/{each.sequence}" for each in still_open[:6])]
+    assert Attempts.read == Counter(once)
+    await log.append(still_open)
     Attempts.read.clear()
-    workers = [await projector_of(log) for _ in range(2)]
-    while await workers[0].runner.fold_next([each.runner for each in workers]) is not None:
-        pass
-    await workers[0].catch_up()
-    assert set(Attempts.read.values()) == {1}
+    await (await projector_of(log)).catch_up()
+    assert Attempts.read == Counter(f"2/{each.sequence}" for each in still_open)
+    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries, ends=False)]
 
 
 async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(
@@ -352,37 +333,17 @@ def _die_in_second_batch(url: str) -> None:
         asyncio.run(fold())
 
 
-@pytest.mark.parametrize("beside_tables", [False, True])
-async def test_a_killed_fold_continues_with_the_state_of_its_episodes(
-    log: EventLog, database_url: str, *, beside_tables: bool
-) -> None:
+async def test_a_killed_fold_continues_with_the_state_of_its_episodes(log: EventLog, database_url: str) -> None:
     tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED"), ("RIGHT", "FAILED"), ("LEFT", "FAILED")]
     records = [*declarations(PICK_UP), *mixed(episode(1, tries), episode(2, tries))]
     await log.append(records)
     await projector_of(log)
-    await Projector(log).open()
-    if not beside_tables:
-        plain = Projector(log)
-        await plain.open()
-        await plain.catch_up()
     process = FORKED.Process(target=_die_in_second_batch, args=(database_url,))
     fork(process)
     await asyncio.to_thread(process.join)
     assert process.exitcode == -signal.SIGKILL
     assert len(await rows_in(log)) == 2
-    if beside_tables:
-        assert await ask(log, "SELECT sum(folded) FROM episode") == [(6,)]
+    assert await ask(log, "SELECT sum(folded) FROM episode") == [(6,)]
     await (await projector_of(log)).catch_up()
     assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
     assert (await verify(log, projections=[Attempts()])).drift == 0
-
-
-def test_an_episode_projection_without_a_fold_is_refused() -> None:
-    class Nothing(EpisodeProjection):
-        name = "nothing"
-        tables = {"nothing": {"n": "integer"}}  # noqa: RUF012 - a common form in user code
-
-    with pytest.raises(TypeError, match="abstract"):
-        Nothing()  # type: ignore[abstract]
-    with pytest.raises(TypeError, match="attempts folds events with what `episode\\(\\)` returns"):
-        Attempts().fold(None, Changes())  # type: ignore[arg-type]

@@ -29,7 +29,6 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
     ObjectValue,
     Observed,
-    PoseValue,
     RefusalValue,
     RobotValue,
     SeenValue,
@@ -166,18 +165,16 @@ def test_a_node_that_ends_in_the_batch_in_which_it_started_is_one_insert() -> No
     ]  # fmt: skip
 
 
-def test_the_end_of_a_node_from_an_earlier_batch_is_an_update() -> None:
+def test_the_end_of_a_node_from_an_earlier_batch_is_an_update_without_a_time_if_it_was_lost() -> None:
     script = Script()
     script.put(NodeEnded(77, "SUCCEEDED"))
+    script.put(NodeEnded(78, "LOST"))
     rows = folded(script)
     assert rows.to_insert() == {}
-    assert rows.node_ends == [(row(77), "SUCCEEDED", 1_000_000_005, 1, None, None, None, None, None)]
-
-
-def test_a_lost_node_has_no_end_time() -> None:
-    script = Script()
-    script.put(NodeEnded(77, "LOST"))
-    assert folded(script).node_ends == [(row(77), "LOST", None, None, None, None, None, None, None)]
+    assert rows.node_ends == [
+        (row(77), "SUCCEEDED", 1_000_000_005, 1, None, None, None, None, None),
+        (row(78), "LOST", None, None, None, None, None, None, None),
+    ]
 
 
 def test_a_lost_episode_makes_its_running_nodes_lost() -> None:
@@ -273,15 +270,6 @@ def test_a_value_recorded_as_missing_or_left_out_is_null() -> None:
     ]
 
 
-def test_nodes_of_the_language_have_a_table_too() -> None:
-    repeat = declared("Repeat", "repeat", field("times", "integer", 2), kind="language")
-    script = Script()
-    script.put(NodeStarted("language", None, name_of(repeat), {"times": 3}))
-    rows_by_table = rows_of(script, repeat)
-    assert rows_by_table["repeat(id,process_metadata_id,times)"] == [(row(1), 1, 3)]
-    assert rows_by_table["task_tree_node"][0][3:5] == ("language", "Repeat")
-
-
 @pytest.mark.parametrize(
     ("event", "reason"),
     [
@@ -345,23 +333,6 @@ def test_a_dict_field_may_contain_the_key_missing_among_others() -> None:
         (0, 1, "missing", None, None, "milk"),
         (1, 1, "bought", None, None, "bread"),
     ]
-
-
-def test_a_pose_keeps_every_bit_of_its_numbers() -> None:
-    script = Script()
-    odd = PoseValue((0.1 + 0.2, -0.0, 5e-324), (1 / 3, 1e300, -1.7976931348623157e308, 0.0), "map", 1999)
-    script.put(ObjectAdded("milk", "MILK", odd))
-    rows_by_table = rows_of(script)["pose"][0]
-    assert [value.hex() for value in rows_by_table[2:9]] == [
-        "0x1.3333333333334p-2",
-        "-0x0.0p+0",
-        "0x0.0000000000001p-1022",
-        "0x1.5555555555555p-2",
-        "0x1.7e43c8800759cp+996",
-        "-0x1.fffffffffffffp+1023",
-        "0x0.0p+0",
-    ]
-    assert rows_by_table[10] == 1
 
 
 # === folded rows ==============================================================================================

@@ -13,12 +13,10 @@ from pathlib import Path
 import asyncpg
 import pytest
 
-from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.operations.destination import LogAndTables, open_destination
 from pycrorm_async.projections import fold_group
-from pycrorm_async.projections.custom_tables import is_stalled
 from pycrorm_async.projections.pipeline import WHOLE, Share
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
@@ -186,37 +184,6 @@ async def test_a_flush_ends_while_others_append_and_one_does_not_fold(
             assert await folder.fold() >= 30
     finally:
         appending.cancel()
-
-
-def test_a_share_is_stalled_if_none_of_its_episodes_has_moved() -> None:
-    assert is_stalled({1: 5, 2: 7}, {1: 6, 2: 7}, 2)
-    assert not is_stalled({1: 5, 2: 7, 4: 9}, {1: 6, 2: 7}, 2)  # 4 is folded
-    assert not is_stalled({}, {1: 6}, 2)
-
-
-@pytest.mark.soak
-def test_a_flush_ends_while_another_daemon_is_stopped(database_url: str, tmp_path: Path) -> None:
-    daemons = [
-        Started("writer", "--url", database_url, "--spool", str(tmp_path / f"spool{each}"), cwd=tmp_path)
-        for each in range(2)
-    ]
-    try:
-        for daemon in daemons:
-            assert daemon.stderr.readline().startswith("draining")
-        settings = Settings(flush_timeout_s=25)  # 10 s less than others need to see it by the events that wait
-        with Memory.sync(database_url, spool=tmp_path / "spool0", writer="daemon", settings=settings) as memory:
-            for stops in (False, True):
-                if stops:
-                    daemons[1].send_signal(signal.SIGSTOP)
-                for _ in range(2):  # one episode of each share
-                    with memory.recording.episode(description="an episode"):
-                        pass
-                    memory.flush()
-        assert ask(database_url, "SELECT count(*), sum(head - folded) FROM episode") == [(4, 0)]
-    finally:
-        for daemon in daemons:
-            daemon.kill()
-            daemon.communicate()
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(60, marks=pytest.mark.soak)])

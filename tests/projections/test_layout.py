@@ -38,13 +38,6 @@ def layout_of(*types: DesignatorTypeDeclared) -> Layout:
     return layout
 
 
-def test_columns_of_one_type_unite_in_the_order_of_declaration() -> None:
-    louder = declared("SayingAction", "saying_action", field("volume", "real", 2), field("text", "text", 3))
-    layout = layout_of(SAYING, louder)
-    assert layout.leaves == {"saying_action": {"text": "text", "volume": "real"}}
-    assert layout_of(SAYING, louder, SAYING) == layout
-
-
 def test_lists_and_dicts_have_no_column() -> None:
     joints = declared("MoveJointsMotion", "move_joints_motion", field("names", "list", 2, item="text"), kind="motion")
     assert layout_of(joints).leaves == {"move_joints_motion": {}}
@@ -82,11 +75,6 @@ def test_a_declaration_that_contradicts_a_table_is_refused_with_both_named(
     with pytest.raises(LayoutConflict) as raised:
         layout_of(SAYING, second)
     assert str(raised.value) == reason
-
-
-def test_a_contradiction_with_another_table_of_the_same_type_is_refused() -> None:
-    with pytest.raises(LayoutConflict):
-        layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
 def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the_type() -> None:
@@ -165,41 +153,6 @@ def test_a_former_name_that_two_types_claim_belongs_to_the_first() -> None:
     # A type that names both continues both.
     both = layout.with_declaration(replace(bow, aliases=("GreetAction", "WelcomeAction")))
     assert both.renamed == {"GreetAction": "BowAction", "WelcomeAction": "BowAction"}
-
-
-def test_a_type_that_returns_to_an_earlier_name_stays_one_type() -> None:
-    back = replace(GREET, aliases=("WelcomeAction",))
-    layout = layout_of(GREET, WELCOME, back)
-    assert layout == layout_of(GREET, WELCOME)
-    assert layout_of(GREET, WELCOME, back, GREET, WELCOME, back) == layout
-
-
-@pytest.mark.parametrize(
-    ("former", "reason"),
-    [
-        (
-            declared("GreetAction", "greet_action", field("whom", "integer", 2)),
-            "whom is declared as integer and as text",
-        ),
-        (
-            declared("GreetAction", "greet_action", field("Whom", "text", 2)),
-            "the column Whom and with whom: rename one",
-        ),
-        (declared("GreetAction", "greet_action", kind="motion"), "declared as motion and as action"),
-    ],
-)
-def test_an_impossible_former_name_is_refused_and_changes_nothing(former: DesignatorTypeDeclared, reason: str) -> None:
-    layout = layout_of(former)
-    with pytest.raises(LayoutConflict, match=reason):
-        layout.with_declaration(WELCOME)
-    assert layout_of(WELCOME).types["WelcomeAction"].tables == ("welcome_action",)
-
-
-def test_tables_that_become_one_type_must_all_agree() -> None:
-    own = replace(declared("WelcomeAction", "ORMWelcome"), aliases=("GreetAction",))
-    layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
-    with pytest.raises(LayoutConflict, match="loud"):
-        layout.with_declaration(own)
 
 
 def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:

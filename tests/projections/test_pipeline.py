@@ -179,9 +179,7 @@ def words_of(number: int, words: int, *, episode: int | None = None) -> list[tup
 @pytest.mark.parametrize(
     ("hand", "batch_events"),
     [
-        (WorkerInLoop, 1),
         (WorkerInLoop, 2),
-        (WorkerInLoop, 7),
         (LosesAnswers, 2),
         (LosesBatches, 2),
         (DiesOften, 2),
@@ -211,8 +209,7 @@ async def test_every_event_is_folded_once_and_in_its_place(
 
 
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("bad", ["unknown", "refused by the database", "missing"])
-@pytest.mark.parametrize("place", [6, 7])
+@pytest.mark.parametrize(("bad", "place"), [("unknown", 6), ("refused by the database", 7), ("missing", 6)])
 async def test_an_episode_stops_where_it_cannot_be_folded_whichever_worker_meets_that(
     log: EventLog, other_log: EventLog, bad: str, place: int
 ) -> None:

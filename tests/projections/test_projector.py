@@ -78,9 +78,7 @@ def rich_episode(number: int) -> Script:
     return script
 
 
-@pytest.mark.parametrize(
-    "batch_events", [1, *(pytest.param(size, marks=pytest.mark.soak) for size in (2, 3, 7)), 10_000]
-)
+@pytest.mark.parametrize("batch_events", [1, 7, 10_000])
 async def test_batches_of_any_size_make_the_same_rows(log: EventLog, batch_events: int) -> None:
     episodes = [rich_episode(1), rich_episode(2)]
     lost = Script(3)
@@ -163,7 +161,7 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_c
     assert await projector.catch_up() == 0
 
 
-@pytest.mark.parametrize("batch_events", [1, 2, 10_000])
+@pytest.mark.parametrize("batch_events", [1, 10_000])
 async def test_an_event_whose_row_exists_already_parks_its_episode_and_changes_nothing(
     log: EventLog, batch_events: int
 ) -> None:
@@ -230,24 +228,19 @@ async def test_views_leave_a_simulation_out_and_tables_hold_it(log: EventLog) ->
         assert (name, *counts) == (name, [(1,)], [(2,)])
 
 
-async def test_doubles_are_stored_bit_by_bit(log: EventLog) -> None:
+async def test_doubles_and_texts_of_any_kind_are_stored_unchanged(log: EventLog) -> None:
     chance = random.Random(11)
-    special = [0.1 + 0.2, 0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]
-    numbers = [*special, *(chance.uniform(-1, 1) * 10.0 ** chance.randint(-300, 300) for _ in range(2_994))]
+    special = [0.1 + 0.2, -0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]
+    numbers = [*special, *(chance.uniform(-1, 1) * 10.0 ** chance.randint(-300, 300) for _ in range(294))]
+    texts = ["", "Käse 🧀", "'; DROP TABLE zz_pose__1001; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
     script = Script()
     for x, y, z in zip(numbers[0::3], numbers[1::3], numbers[2::3], strict=True):
         script.put(ObjectAdded("milk", "MILK", PoseValue((x, y, z), (0.0, 0.0, 0.0, 1.0), "map", 0)))
-    await stored_and_folded(log, script.records)
-    stored = [value for values in await ask(log, "SELECT x, y, z FROM pose ORDER BY id") for value in values]
-    assert [value.hex() for value in stored] == [value.hex() for value in numbers]
-
-
-async def test_text_of_any_kind_is_stored_unchanged(log: EventLog) -> None:
-    texts = ["", "Käse 🧀", "'; DROP TABLE zz_pose__1001; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
-    script = Script()
     for text in texts:
         script.put(NodeStarted("action", None, name_of(SAYING), {"text": text}))
     await stored_and_folded(log, [*declarations(SAYING), *script.records])
+    stored = [value for values in await ask(log, "SELECT x, y, z FROM pose ORDER BY id") for value in values]
+    assert [value.hex() for value in stored] == [value.hex() for value in numbers]
     assert [text for (text,) in await ask(log, "SELECT text FROM saying_action ORDER BY id")] == texts
 
 
@@ -286,28 +279,7 @@ async def test_a_generation_is_read_again_only_where_number_revision_or_version_
         assert await read_generation(connection, "tables/making", known=known) is None
 
 
-async def test_a_projector_folds_into_the_columns_that_another_one_has_added_meanwhile(log: EventLog) -> None:
-    one, other = Projector(log), Projector(log)
-    await one.open()
-    await other.open()
-    for number, dtype in enumerate(("FirstAction", "SecondAction", "ThirdAction"), 1):
-        for projector, sign in ((one, 1), (other, 2)):
-            with_type = declared(
-                dtype, dtype.lower(), *(field(f"f{each}", "text", each + 1) for each in range(1, sign + 1))
-            )
-            script = Script(2 * number + sign)
-            script.put(EpisodeStarted("", "me", "host", "1.0", "3.11"))
-            parameters = {f"f{each}": f"{dtype} {sign}" for each in range(1, sign + 1)}
-            script.put(NodeStarted("action", None, name_of(with_type), parameters))
-            await log.append([*declarations(with_type), *script.records])
-            assert await projector.catch_up() == 2
-        assert await ask(log, f"SELECT f1, f2 FROM {dtype.lower()} ORDER BY id") == [
-            (f"{dtype} 1", None),
-            (f"{dtype} 2", f"{dtype} 2"),
-        ]
-
-
-@pytest.mark.parametrize("missing", [1, 2, 3])
+@pytest.mark.parametrize("missing", [1, 3])
 async def test_a_missing_event_parks_its_episode_and_the_others_continue(log: EventLog, missing: int) -> None:
     projector = Projector(log)
     await projector.open()

@@ -14,11 +14,9 @@ from pathlib import Path
 import msgspec
 import pytest
 from sqlalchemy import func, select
-from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
-from pycrorm_async.events.types import Happening
 from pycrorm_async.operations import rebuild as rebuilding
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.workers import Assignment
@@ -120,7 +118,6 @@ FAILED = 'SELECT * FROM "Failed" ORDER BY id'
         (100, 46, {0, 1}, 0.4, []),  # of 105 events the smaller share has 45
         (100, 45, {0, 1}, 1.0, []),
         (100, 45, {0}, 0.0, []),
-        pytest.param(100, 45, {0, 1, 2, 3}, 2.4, [2], marks=pytest.mark.soak),
     ],
 )
 @pytest.mark.usefixtures("forked_workers")
@@ -283,33 +280,6 @@ async def test_events_folded_while_the_new_tables_are_published_are_in_them(
     await log.close()
 
 
-class EndedError(Exception):
-    """Raised in place of whatever may end the rebuild."""
-
-
-@pytest.mark.soak_on("postgresql")
-async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steps, "_BATCH_EVENTS", 40)
-    await append_and_fold(
-        database_url, [*TYPES, *(each for number in range(1, 21) for each in picking(number).records)]
-    )
-    before = tables_of(database_url)
-
-    def interrupted(done: int, total: int, what: str | None = None) -> None:
-        if done >= total // 2:
-            raise EndedError
-
-    with pytest.raises(EndedError):
-        await rebuild_memory(database_url, report_progress=interrupted)
-    assert differences(before, tables_of(database_url)) == []
-    progress: list[int] = []
-    done = await rebuild_memory(database_url, report_progress=lambda done, *_: progress.append(done))
-    assert progress[0] > 150
-    assert done.generation == 1002
-    assert differences(before, tables_of(database_url)) == []
-    assert traces(database_url) == []
-
-
 @pytest.mark.soak_on("postgresql")
 async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next batch of an episode longer than one batch begins where the batch that is being written ends."""
@@ -358,22 +328,6 @@ async def test_a_rebuild_cancelled_at_any_moment_is_continued(
 async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class NothingToDo:
-        reads: frozenset[str] | None = None
-
-        def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
-            return spans
-
-        async def restore(self, log: EventLog, spans: Sequence[Span]) -> None: ...
-
-        async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None: ...
-
-        def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> None: ...
-
-        async def ready(self, engine: AsyncEngine, generation: int) -> None: ...
-
-        async def write(self, connection: AsyncConnection, generation: int) -> None: ...
-
     ended = b'{"node":1,"status":"SUCCEEDED"}'
     events = [
         StoredEvent(number, turn, "NodeEnded", 1, 1, 1, ended) for number in range(1, 101) for turn in range(1, 21)
@@ -386,7 +340,7 @@ async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short(
     monkeypatch.setattr(EventLog, "spans", read)
     log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/memory.db"), create=True)
     await Projector(log).open()
-    runner = FoldRunner(LiveTarget(log), lambda layout, _: (layout, NothingToDo))
+    runner = FoldRunner(LiveTarget(log))
 
     async def other() -> None:
         nonlocal turns
@@ -465,20 +419,6 @@ async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_it
             assert len((await session.scalars(select(PickUpAction.id))).all()) == 5
         assert differences(before, tables_of(url)) == []
         assert (await rebuild_memory(url)).left == []
-    assert traces(url) == []
-
-
-@pytest.mark.soak
-@pytest.mark.usefixtures("few_attempts")
-async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: Server) -> None:
-    url = server.new_database()
-    await append_and_fold(url, [*TYPES, *picking(1).records])
-    ask_to_change(url, "CREATE VIEW public.mine AS SELECT id FROM memory.pick_up_action")
-    done = await rebuild_memory(url)
-    assert "zz_pick_up_action__1001" in done.left
-    assert ask(url, "SELECT count(*) FROM public.mine") == [(5,)]
-    ask_to_change(url, "DROP VIEW public.mine")
-    assert (await rebuild_memory(url)).left == []
     assert traces(url) == []
 
 

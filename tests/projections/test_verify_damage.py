@@ -95,15 +95,12 @@ CANNOT = "is in the tables, and cannot be folded:"
 @pytest.mark.parametrize(
     ("change", "reasons"),
     [
-        (f"DELETE FROM event {OF_2} 9", ["event 9: is missing"]),
         (
             "DELETE FROM event WHERE episode = 2 AND sequence IN (5, 6, 9)",
             ["event 5: is missing", "event 9: is missing"],
         ),
-        (f"DELETE FROM event {OF_2} 20", ["event 20: is missing"]),
         ("DELETE FROM event WHERE episode = 2", ["event 1: is missing"]),
         (f"{ONE_MORE.format(2, 21)} {OF_2} 20", ["event 21: exists, but the episode must end with event 20"]),
-        (f"{ONE_MORE.format(2, 0)} {OF_2} 20", ["event 0: exists, but the episode must end with event 20"]),
         (
             f"UPDATE event SET sequence = 25 {OF_2} 20",
             ["event 25: exists, but the episode must end with event 20", "event 20: is missing"],
@@ -111,10 +108,6 @@ CANNOT = "is in the tables, and cannot be folded:"
         (
             f"UPDATE event SET payload = '?' {OF_2} 9",
             [f"event 9: {CANNOT} ObjectDetected cannot be decoded: JSON is malformed: invalid character (byte 0)"],
-        ),
-        (
-            f'UPDATE event SET payload = \'{{"node":"x","status":"LOST"}}\' {OF_2} 8',
-            [f"event 8: {CANNOT} NodeEnded cannot be decoded: Expected `int`, got `str` - at `$.node`"],
         ),
         (
             f"UPDATE event SET type = 'RobotDanced' {OF_2} 4",
@@ -175,7 +168,7 @@ async def test_a_changed_value_in_a_payload_is_a_difference_of_the_tables(
     assert result.differences[2][4:] == ("camera", "world_state")
 
 
-@pytest.mark.parametrize("name", ["", "no name", "zz\x1b", "{}0"])
+@pytest.mark.parametrize("name", ["zz\x1b", "{}0"])
 async def test_a_changed_name_of_a_declaration_is_reported(log: EventLog, database_url: str, name: str) -> None:
     name = name.format(name_of(NAVIGATE))
     ask_to_change(

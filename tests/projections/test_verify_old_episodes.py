@@ -35,7 +35,7 @@ def change(database: Path, guard: str, statement: str, *values: str) -> None:
     connection.close()
 
 
-@pytest.mark.parametrize("identity", ["", "gar\x1bbage", "018bcfe5-6800-7000-8000-00000000000g", "1" * 4000])
+@pytest.mark.parametrize("identity", ["", "gar\x1bbage", "1" * 4000])
 def test_a_damaged_id_of_an_episode_is_reported_as_damage(database: Path, tmp_path: Path, identity: str) -> None:
     change(database, "episode_is_not_renamed", "UPDATE episode SET id = ? WHERE number = 1", identity)
     url = f"sqlite:///{database}"
@@ -63,10 +63,5 @@ def test_where_an_episode_without_a_digest_differs_no_rebuild_is_recommended(dat
 
 
 def test_a_tag_is_recorded_as_other_texts_are() -> None:
-    assert checked_tags(["a\x00b", "a\udc80", "tab\t", "esc\x1b", "kitchen"]) == (
-        "a\\x00b",
-        "a\\udc80",
-        "tab\t",
-        "esc\x1b",
-        "kitchen",
-    )
+    tags = ["a\x00b", "a\udc80", "tab\t", "esc\x1b", "kitchen"]
+    assert checked_tags(tags) == ("a\\x00b", "a\\udc80", "tab\t", "esc\x1b", "kitchen")
