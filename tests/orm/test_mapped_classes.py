@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from inspect import isabstract
 from typing import Any
@@ -37,7 +35,6 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.record.plan_types import declared_type
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import ObjectType
-from tests.commands import environment
 from tests.projections.event_script import Script, declarations, declared, name_of, pose
 from tests.projections.event_script import field as script_field
 from tests.projections.sql_queries import stored_and_folded
@@ -81,21 +78,6 @@ def test_every_designator_has_a_mapped_class_into_whose_table_it_fits(designator
             assert hasattr(mapped, kind)
     layout = Layout().with_leaves(mapped_leaves())
     assert layout.with_declaration(declaration) == layout
-
-
-_LIGHT = """
-import sys
-import pycrorm_async.cli.copy, pycrorm_async.cli.rebuild, pycrorm_async.cli.verify, pycrorm_async.cli.writer
-import pycrorm_async.cli.status
-raise SystemExit("the mapped classes are imported" if "pycrorm_async.orm" in sys.modules else 0)
-"""
-
-
-@pytest.mark.slow
-def test_commands_that_query_no_mapped_class_import_none() -> None:
-    command = [sys.executable, "-c", _LIGHT]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 def test_every_name_of_the_thesis_exists() -> None:

@@ -64,7 +64,6 @@ from pycrorm_async.orm import (
 from pycrorm_async.orm.base import UtcTime
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
@@ -499,18 +498,3 @@ async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: Ev
     await stored_and_folded(log, [*declarations(PICK_UP, OPEN), *script.records])
     (failure,) = await every(log, select(RootFailure))
     assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)
-
-
-async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
-    script = failing()
-    for place, each in enumerate(script.records[:-3]):  # the second episode has none
-        if each.type in ("EpisodeStarted", "NodeStarted"):
-            simulated = each.payload.replace(b"{", b'{"simulated":true,', 1)
-            script.records[place] = each._replace(payload=simulated)
-    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *script.records])
-    reading = Reading(log)
-    counts = []
-    for also in (False, True):
-        async with reading.session(simulated=also) as session:
-            counts.append(len((await session.scalars(select(RootFailure))).all()))
-    assert counts == [1, 4]

@@ -216,18 +216,6 @@ async def test_a_descendant_is_listed_with_its_base_even_if_the_base_was_declare
     assert await ask(log, "SELECT * FROM careful_grab_action") == [(row(1), None, "LEFT", 0.5, 1, 1)]
 
 
-async def test_views_leave_a_simulation_out_and_tables_hold_it(log: EventLog) -> None:
-    episodes = [Script(1), Script(2)]
-    for script, simulated in zip(episodes, (False, True), strict=True):
-        script.put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated))
-        script.put(ObjectAdded("milk", "MILK", pose()))
-        script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}, simulated=simulated))
-    await stored_and_folded(log, [*declarations(SAYING), *mixed(*episodes)])
-    for name in ("process_metadata", "object", "pose", "task_tree_node", "saying_action"):
-        counts = [await ask(log, f"SELECT count(*) FROM {each}") for each in (name, f"zz_{name}__1001")]
-        assert (name, *counts) == (name, [(1,)], [(2,)])
-
-
 async def test_doubles_and_texts_of_any_kind_are_stored_unchanged(log: EventLog) -> None:
     chance = random.Random(11)
     special = [0.1 + 0.2, -0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]

@@ -5,22 +5,19 @@ from __future__ import annotations
 import asyncio
 import multiprocessing
 import os
-import random
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 
 import msgspec
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.operations import rebuild as rebuilding
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.workers import Assignment
-from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
+from pycrorm_async.orm import PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild
 from pycrorm_async.projections import rebuild as steps
 from pycrorm_async.projections.mapped_tables import UserView
@@ -186,64 +183,6 @@ async def test_missing_tables_are_made(database_url: str) -> None:
     assert traces(database_url) == []
 
 
-@pytest.mark.soak
-async def test_events_folded_beside_many_rebuilds_are_in_the_tables(
-    database_url: str, tmp_path: Path, in_turn: bool
-) -> None:
-    await fold_beside(database_url, tmp_path, rebuilds=8 if in_turn else 50)
-
-
-async def fold_beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
-    await append_and_fold(
-        database_url, [*TYPES, *(each for number in range(1, 30) for each in picking(number).records)]
-    )
-    over = asyncio.Event()
-    seen: list[tuple[int, ...]] = []
-
-    async def record() -> None:
-        log = await EventLog.open(DatabaseAddress.parse(database_url), create=True, busy_timeout_s=60)
-        projector = Projector(log, batch_events=50)
-        await projector.open()
-        number = 30
-        while not over.is_set():
-            # Record in pieces, so that an episode is switched in its middle, with a type that is declared during the
-            # rebuild.
-            records = whispering(number) if number == 40 else picking(number).records
-            for place in range(0, len(records), 4):
-                assert await log.append(records[place : place + 4]) == {}
-                await projector.fold_next_batch()
-            await asyncio.sleep(0.01)
-            number += 1
-        await projector.catch_up()
-        await log.close()
-
-    async def read() -> None:
-        query = [
-            select(func.count()).select_from(each) for each in (TaskTreeNode, PickUpAction, TaskTreeNode.__table__)
-        ]
-        async with Reading.open(database_url) as reading:
-            while not over.is_set():
-                async with reading.session() as session:
-                    counts = [(await session.scalars(each)).one() for each in query]
-                    counts.append(len((await session.scalars(select(Action.id))).all()))
-                seen.append((len(await reading.episodes()), *counts))
-                await asyncio.sleep(0)
-
-    async with asyncio.TaskGroup() as group:
-        group.create_task(record())
-        group.create_task(read())
-        for _ in range(rebuilds):
-            assert (await rebuild_memory(database_url)).left == []
-        over.set()
-    assert len(seen) > rebuilds
-    for one, next_one in pairwise(seen):
-        assert all(before <= after for before, after in zip(one, next_one, strict=True)), (one, next_one)
-    assert ask(database_url, "SELECT count(*) FROM episode WHERE folded < head OR parked IS NOT NULL") == [(0,)]
-    assert differences(tables_of(database_url), await folded_elsewhere(database_url, tmp_path)) == []
-    await rebuild_memory(database_url)
-    assert traces(database_url) == []
-
-
 @pytest.mark.soak_on("sqlite")
 async def test_events_folded_while_the_new_tables_are_published_are_in_them(
     database_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -294,35 +233,6 @@ async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.M
         assert (sum(counts), min(counts) > 0) == (total, True)
         await rebuild.show()
     await log.close()
-
-
-@pytest.mark.soak_on("postgresql")
-async def test_a_rebuild_cancelled_at_any_moment_is_continued(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(steps, "_BATCH_EVENTS", 9)
-    await every_kind_of_episode(database_url, tmp_path / "spool")
-    before, stopped = tables_of(database_url), ask(database_url, STOPPED)
-    moments = random.Random(1)
-    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
-
-    async def fold(rebuild: Rebuild) -> None:
-        while await rebuild.fold_next_batch() is not None:
-            pass
-
-    async with claimed(log):
-        for _ in range(12):
-            task = asyncio.create_task(fold(await Rebuild.begin(log)))
-            await asyncio.wait([task], timeout=moments.uniform(0.001, 0.1))
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
-            assert not any("_prepared" in repr(each) for each in asyncio.all_tasks())
-    await log.close()
-    await rebuild_memory(database_url)
-    assert differences(before, tables_of(database_url)) == []
-    assert ask(database_url, STOPPED) == stopped
-    assert traces(database_url) == []
 
 
 async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import sqlite3
 from typing import Any
 
 import pytest
 from sqlalchemy import BigInteger, Boolean, Column, Double, Integer, MetaData, Table, Text, select
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged, LogWentBack
+from pycrorm_async.errors import DamageError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_text
 from pycrorm_async.store.append import Appending
@@ -165,21 +164,6 @@ async def test_a_record_without_an_episode_that_is_no_declaration_is_damage(log:
 
 
 # --- an unavailable database ------------------------------------------------------------------------------------------
-
-
-async def test_a_database_locked_by_another_writer_is_unavailable_and_takes_the_batch_afterwards(
-    file_log: EventLog,
-) -> None:
-    impatient = await EventLog.open(file_log.address, create=True, busy_timeout_s=0.05)
-    holder = sqlite3.connect(file_log.address.path, isolation_level=None)
-    holder.execute("BEGIN IMMEDIATE")
-    with pytest.raises(DatabaseUnavailable, match="database is locked"):
-        await impatient.append(run_of(episode(1), 1, 3))
-    holder.execute("ROLLBACK")
-    holder.close()
-    await impatient.append(run_of(episode(1), 1, 3))
-    await impatient.close()
-    assert ask(file_log.address.path, "SELECT count(*) FROM event") == [(3,)]
 
 
 async def test_a_log_replaced_by_garbage_is_reported_as_a_fault_of_the_system(file_log: EventLog) -> None:

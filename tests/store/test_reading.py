@@ -11,15 +11,13 @@ from sqlalchemy import text
 
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.store import schema, sqlite
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.append import EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite_engine import StoppableConnection
 from pycrorm_async.store.stored import Incarnation, Span
-from tests.databases import Server, ask, ask_to_change, change_each
+from tests.databases import Server, ask, change_each
 from tests.store.factories import episode, record, run_of
 
 
@@ -60,17 +58,6 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
         await park(connection, 1, None)
     assert [(row.number, row.head) for row in await log.behind()] == [(1, 5), (2, 1)]
     assert await log.stopped() == []
-
-
-@pytest.mark.slow
-async def test_a_memory_and_an_open_episode_near_their_limits_are_named(log: EventLog, database_url: str) -> None:
-    await log.append([*run_of(episode(1), 1, 2), *run_of(episode(2), 1, 2, position=3)])
-    assert await log.limits_near() == []
-    await log.store([record(episode(3), 1)], numbers={episode(3): EPISODE_NUMBER_MAX * 9 // 10 + 1})
-    ask_to_change(database_url, f"UPDATE episode SET head = {EVENTS_MANY} WHERE number = 1")
-    numbers, events = await log.limits_near()
-    assert numbers.startswith("1,932,735,283 of 2,147,483,647 episode numbers are used")
-    assert events.startswith("episode 1 (")
 
 
 async def test_a_snapshot_shows_the_same_events_while_others_are_appended(log: EventLog) -> None:
