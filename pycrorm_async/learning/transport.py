@@ -146,7 +146,7 @@ class TransportPolicy:
         described = robot.one_arm(way.arm)
         tool_link = robot.body.link_pose_at(described.tool_frame, described.park)
         tool = base @ objects.in_link(tool_link, described.tool_in_link).relative_to(robot.body.pose)
-        goals = geometry.pick_up_poses(target.pose, way.grasp, tool)
+        goals = geometry.pick_up_poses(robot.description, target.pose, way.grasp, tool)
         reach = locations.reaching_arms(robot, way.arm, base, lambda _: goals, torso_height=torso, grasps=True)
         return reach.refusal is None
 

@@ -138,7 +138,7 @@ class PickUpActionPerformable(CheckedAction):
     """Grasp an object with one arm and lift it by 3 cm; afterwards it is attached to the gripper.
 
     `grasp` sets the gripper's orientation in the object's own axes. The gripper opens 0.1 m before the object, measured
-    along the direction in which it points when the action begins.
+    along its fingers; those of a PR2 in the direction in which they point when the action begins.
 
     Raises:
         IKError: one of the three goals of the arm is out of reach.
@@ -164,7 +164,8 @@ class PickUpActionPerformable(CheckedAction):
         geometry.check_takable(robot, self.arm, target)
         if robot_motions.collisions_count():
             geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, self.grasp))
-        before, at, above = geometry.pick_up_poses(target.pose, self.grasp, robot.tool_pose(self.arm))
+        tool = robot.tool_pose(self.arm)
+        before, at, above = geometry.pick_up_poses(robot.description, target.pose, self.grasp, tool)
         await robot_motions.MoveTCPMotion(
             before, self.arm, allow_gripper_collision=True, _object_name=target.name
         ).perform()

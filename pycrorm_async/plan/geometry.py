@@ -11,7 +11,7 @@ from pycrorm_async.plan.objects import CurrentRobot, ObjectLike, ObjectPart, in_
 from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, ArmDescription
+from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, ArmDescription, RobotDescription
 
 # === articulation =============================================================================================
 #
@@ -185,13 +185,17 @@ class PickUpPoses(NamedTuple):
     above: poses.Pose
 
 
-def pick_up_poses(object_pose: poses.Pose, grasp: poses.Grasp, tool: poses.Pose) -> PickUpPoses:
+def pick_up_poses(
+    description: RobotDescription, object_pose: poses.Pose, grasp: poses.Grasp, tool: poses.Pose
+) -> PickUpPoses:
     """Return the goals for an object at this pose and a tool frame that is at `tool` now.
 
-    The approach follows the gripper's *current* direction, not the direction it will have at the object.
+    A PR2's approach follows the gripper's *current* direction, as in the thesis, that of other robots the direction
+    which the gripper has at the object (`RobotDescription.approaches_along_fingers`).
     """
     orientation = grasp_orientation(object_pose, grasp)
-    back = poses.rotated(tool.orientation, (-APPROACH_M, 0.0, 0.0))
+    along = orientation if description.approaches_along_fingers else tool.orientation
+    back = poses.rotated(along, (-APPROACH_M, 0.0, 0.0))
     x, y, z = object_pose.position
     frame = object_pose.frame
     return PickUpPoses(

@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import numpy as np
@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 from pycrorm_async.plan import failures, geometry, objects
 from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Search, recorder
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.motions import arm_collision, chosen_limits, collisions_count
+from pycrorm_async.plan.motions import chosen_limits, clear_posture, collisions_count
 from pycrorm_async.plan.task import current_node
 from pycrorm_async.world import queries
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object, current_world
-from pycrorm_async.world.kinematics import Unreachable, headings, solve
+from pycrorm_async.world.kinematics import Unreachable, headings, postures
 from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, yaw_quaternion
 from pycrorm_async.world.urdf import Drive, PR2Description
 from pycrorm_async.world.world_copy import acting_robot
@@ -248,17 +248,18 @@ def reaching_arms(
     reaching: list[Arms] = []
     refusals: list[str] = []
     for candidate in _each(robot, arm):
+        answers = [
+            postures(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
+            for each in goals(candidate)
+        ]
         try:
-            postures = [
-                solve(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
-                for each in goals(candidate)
-            ]
+            all_answers = [chain([next(each)], each) for each in answers]
         except Unreachable as unreachable:
             refusals.append(f"{candidate.name}: {unreachable.reason}")
             continue
-        if torso_height is not None and robot.description.torso_joint is not None:
-            postures = [{robot.description.torso_joint: torso_height, **each} for each in postures]
-        if collides and (collision := _collision(robot, candidate, postures, base_pose, grasps=bool(grasps))):
+        lift = robot.description.torso_joint
+        torso = {} if torso_height is None or lift is None else {lift: torso_height}
+        if collides and (collision := _collision(robot, candidate, all_answers, torso, base_pose, grasps=bool(grasps))):
             refusals.append(f"{candidate.name}: " + "it would be in {1.name} with {0}".format(*collision))
             continue
         reaching.append(candidate)
@@ -267,15 +268,22 @@ def reaching_arms(
 
 
 def _collision(
-    robot: objects.CurrentRobot, arm: Arms, postures: Iterable[dict[str, float]], base: Pose, *, grasps: bool
+    robot: objects.CurrentRobot,
+    arm: Arms,
+    answers: Iterable[Iterable[dict[str, float]]],
+    torso: dict[str, float],
+    base: Pose,
+    *,
+    grasps: bool,
 ) -> tuple[str, Object] | None:
-    """Return the first collision of the arm at these postures, as its motions will find it."""
+    """Return the first collision of the arm at goals with these postures each, as its motions will find it."""
     tool_frame = robot.description.arms[arm].tool_frame
     held = [] if grasps else [each for each, link in robot.body.attachments.items() if link == tool_frame]
-    for joints in postures:
-        collision = arm_collision(robot, arm, joints, gripper_may_touch=grasps, held=held, base=base)
-        if collision is not None:
-            return collision
+    for each in answers:
+        lifted = (torso | joints for joints in each)
+        clear = clear_posture(robot, arm, lifted, gripper_may_touch=grasps, held=held, base=base)
+        if isinstance(clear, tuple):
+            return clear
         held = []  # it is released at the first goal
     return None
 
@@ -317,7 +325,7 @@ def _goals(
     tool_frame = description.arms[arm].tool_frame
     tool = robot.tool_pose(arm)
     if not isinstance(target, Pose):
-        return geometry.pick_up_poses(goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
+        return geometry.pick_up_poses(description, goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
     held = next((each for each, link in body.attachments.items() if link == tool_frame), None)
     tool_goal = geometry.place_pose(goal, held.pose, tool) if held is not None else goal
     return tool_goal, geometry.retract(tool_goal)

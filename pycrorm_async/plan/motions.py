@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Awaitable, Mapping, Sequence
+from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -26,7 +26,7 @@ from pycrorm_async.plan.task import Performable, current_node
 from pycrorm_async.world import pose as poses
 from pycrorm_async.world.arms import Chain
 from pycrorm_async.world.bullet import Object, current_world
-from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.kinematics import Unreachable, postures
 from pycrorm_async.world.queries import collisions_at
 from pycrorm_async.world.urdf import Drive, FieldOfView, Limits, PR2Description
 from pycrorm_async.world.world_copy import acting_robot
@@ -526,10 +526,8 @@ class SimulatedModules:
 
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
         robot = objects.require_robot()
-        joints = self._solve(robot, motion.arm, motion.target)
-        if self._collisions:
-            self._check_clear(robot, motion, joints)
-        robot.body.set_joint_positions(joints)
+        answers = self._postures(robot, motion.arm, motion.target)
+        robot.body.set_joint_positions(self._clear(robot, motion, answers) if self._collisions else next(answers))
 
     async def looking(self, motion: LookingMotion) -> None:
         robot = objects.require_robot()
@@ -589,26 +587,53 @@ class SimulatedModules:
             message = f"{tool_frame} is not on {handle.link} but {distance:.3f} m away: grasp it first"
             raise failures.EnvironmentManipulationImpossible(message, handle.link, distance)
         grip = tool.relative_to(handle.whole.link_pose(handle.link))
-        path = [self._solve(robot, arm, each @ grip) for each in geometry.handle_poses(handle, goal)]
+        path = [next(self._postures(robot, arm, each @ grip)) for each in geometry.handle_poses(handle, goal)]
         robot.body.set_joint_positions(path[-1])
         handle.whole.set_joint_position(handle.joint, goal)
 
-    def _solve(self, robot: objects.CurrentRobot, arm: poses.Arms, target: poses.Pose) -> dict[str, float]:
-        """Return the arm's joint angles for a tool frame at the target. Raises `IKError`."""
+    def _postures(self, robot: objects.CurrentRobot, arm: poses.Arms, target: poses.Pose) -> Iterator[dict[str, float]]:
+        """Yield the arm's joint angles for a tool frame at the target. Raises `IKError` if there are none."""
         tool_frame = robot.one_arm(arm).tool_frame
         try:
-            return solve(robot.body, arm, target, limits=self._limits)
+            yield from postures(robot.body, arm, target, limits=self._limits)
         except Unreachable as unreachable:
             raise failures.IKError(target, arm, tool_frame, unreachable.reason) from unreachable
 
-    def _check_clear(self, robot: objects.CurrentRobot, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
-        """Raise `ManipulationGoalInCollision` if the arm or the held object collides at these joint angles."""
+    def _clear(
+        self, robot: objects.CurrentRobot, motion: MoveTCPMotion, answers: Iterator[dict[str, float]]
+    ) -> dict[str, float]:
+        """Return the first posture at which neither the arm nor the held object collides.
+
+        Raises `ManipulationGoalInCollision`.
+        """
         held = [obj for obj, link in robot.body.attachments.items() if link == robot.one_arm(motion.arm).tool_frame]
         may_touch = bool(motion.allow_gripper_collision)
-        if (collision := arm_collision(robot, motion.arm, joints, gripper_may_touch=may_touch, held=held)) is not None:
-            part, obj = collision
-            message = f"at its goal the {motion.arm.name} arm would be in {obj.name} with {part}"
-            raise failures.ManipulationGoalInCollision(message, part, obj.name)
+        clear = clear_posture(robot, motion.arm, answers, gripper_may_touch=may_touch, held=held)
+        if isinstance(clear, dict):
+            return clear
+        part, obj = clear
+        message = f"at its goal the {motion.arm.name} arm would be in {obj.name} with {part}"
+        raise failures.ManipulationGoalInCollision(message, part, obj.name)
+
+
+def clear_posture(
+    robot: objects.CurrentRobot,
+    arm: poses.Arms,
+    answers: Iterable[dict[str, float]],
+    *,
+    gripper_may_touch: bool,
+    held: Sequence[Object] = (),
+    base: poses.Pose | None = None,
+) -> dict[str, float] | tuple[str, Object]:
+    """Return the first of these postures, of which there is one, without an `arm_collision`, else that of the first."""
+    first: tuple[str, Object] | None = None
+    for joints in answers:
+        collision = arm_collision(robot, arm, joints, gripper_may_touch=gripper_may_touch, held=held, base=base)
+        if collision is None:
+            return joints
+        first = first or collision
+    assert first is not None
+    return first
 
 
 def arm_collision(

@@ -186,6 +186,6 @@ def _reach(robot: objects.CurrentRobot, base_pose: Pose, target_pose: Pose, past
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
         tool = robot.tool_pose(arm)
-        return geometry.pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
+        return geometry.pick_up_poses(description, target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
     return locations.reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height, grasps=True)

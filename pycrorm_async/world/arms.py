@@ -235,6 +235,10 @@ STARTS_MAX = 100
 TIME_MAX_S = 1.0
 """Bounds a search, because the library never ends one whose first step is not a number. That happens at postures where
 joints are in line with each other and with the target, which `_start` avoids; a search takes some milliseconds."""
+POSTURES_MAX = 8
+"""Bounds the postures for one target: more are tried only where those before collide."""
+_ALIKE = 1e-3
+"""The greatest difference of the joints, rad or m, of two answers that count as one posture."""
 _ERROR_MAX = 1e-14
 """Square of the distance, m² and rad², at which a search ends; `kinematics` checks the answer."""
 DESCENTS_MAX, STEPS_MAX = 20, 60
@@ -291,9 +295,10 @@ class Chain:
         """The tool's frame in the link that the last joint moves."""
         first = next((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), 0)
         self._to_first = self._arm[: first + 1]
-        lengths = [_norm(each.origin) for each in self._arm[first + 1 :]]
-        slides = [max(map(abs, each.bounds)) for each in self._arm if each.kind is JointType.PRISMATIC]
-        self.reach_m = sum(lengths) + sum(slides) + (_norm(tool_in_link) if tool_in_link else 0.0)
+        slides = sum(max(map(abs, each.bounds)) for each in self._arm if each.kind is JointType.PRISMATIC)
+        self._wrist_reach_m = slides + sum(_norm(each.origin) for each in self._moving[first + 1 :])
+        fixed = sum(_norm(each.origin) for each in self._arm[last + 1 :])
+        self.reach_m = self._wrist_reach_m + fixed + (_norm(tool_in_link) if tool_in_link else 0.0)
         """The greatest distance of the tool from the first joint, in any posture."""
 
     @cached_property
@@ -317,18 +322,25 @@ class Chain:
             if each.kind in (JointType.REVOLUTE, JointType.CONTINUOUS)
         }
 
-    def distance_m(self, target: Pose, positions: Mapping[str, float]) -> float:
-        """Return the distance of a target in the root link from the first joint of the arm, with that joint at 0."""
-        return math.dist(self.first_joint(positions), target.position)
-
     def first_joint(self, positions: Mapping[str, float]) -> Vector:
         """Return the position of the first joint of the arm in the root link, with that joint at 0."""
         return along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)}).position
 
-    def solve(
+    def beyond(self, target: Pose, positions: Mapping[str, float]) -> tuple[float, float] | None:
+        """Return how far a target in the root link is from the first joint of the arm, and the reach; None within it.
+
+        An arm that holds the whole orientation has its last joint, the wrist, at one point: that must be within reach.
+        """
+        end, reach_m = target, self.reach_m
+        if self.held is Held.ALL:
+            end, reach_m = target @ self._behind.inverse(), self._wrist_reach_m
+        distance_m = math.dist(self.first_joint(positions), end.position)
+        return (distance_m, reach_m) if distance_m > reach_m else None
+
+    def postures(
         self, target: Pose, positions: Mapping[str, float], bounds: Mapping[str, Bounds]
-    ) -> dict[str, float] | None:
-        """Return positions of the arm's joints for a target in the root link; None if no start led to it.
+    ) -> Iterator[dict[str, float]]:
+        """Yield different positions of the arm's joints for a target in the root link; none if no start leads to it.
 
         Args:
             positions: of the joints above the arm; those of the arm have no effect.
@@ -336,25 +348,35 @@ class Chain:
         """
         ranges = tuple(_within_a_turn(bounds[name]) for name in self.joints)
         if any(lower > upper for lower, upper in ranges):
-            return None
+            return
         goal = target.relative_to(along(self._above, positions))
         moving = self._moving
         slides = any(each.kind is JointType.PRISMATIC or each.mimic is not None for each in moving)
+        answers: Iterator[Sequence[float]]
         if slides or self.held is not Held.ALL:
-            angles = next(_postures(moving, ranges, positions, self._behind, goal, self.held, DESCENTS_MAX), None)
+            answers = _postures(moving, ranges, positions, self._behind, goal, self.held, DESCENTS_MAX)
         else:
-            solver = self._solvers.get(ranges)
-            if solver is None:
-                self._solvers[ranges] = solver = _solver(moving, ranges)
-            config = _optik().SolverConfig(max_time=TIME_MAX_S, max_restarts=STARTS_MAX, tol_f=_ERROR_MAX)
-            answer = solver.ik(config, _matrix(goal @ self._behind.inverse()), _start(ranges, 0))
-            angles = None if answer is None else answer[0]
-        if angles is None:
-            return None
-        return {
-            name: min(max(angle, lower), upper)
-            for name, angle, (lower, upper) in zip(self.joints, angles, ranges, strict=True)
-        }
+            answers = self._from_starts(goal @ self._behind.inverse(), ranges)
+        earlier: list[NDArray[np.float64]] = []
+        for angles in answers:
+            if all(np.abs(np.subtract(angles, each)).max() > _ALIKE for each in earlier):
+                earlier.append(np.array(angles))
+                yield {
+                    name: min(max(angle, lower), upper)
+                    for name, angle, (lower, upper) in zip(self.joints, angles, ranges, strict=True)
+                }
+
+    def _from_starts(self, wrist: Pose, ranges: tuple[Bounds, ...]) -> Iterator[Sequence[float]]:
+        """Yield the answers of the library for a frame of the last joint, each from another start."""
+        solver = self._solvers.get(ranges)
+        if solver is None:
+            self._solvers[ranges] = solver = _solver(self._moving, ranges)
+        config = _optik().SolverConfig(max_time=TIME_MAX_S, max_restarts=STARTS_MAX, tol_f=_ERROR_MAX)
+        for start in range(POSTURES_MAX):
+            answer = solver.ik(config, _matrix(wrist), _start(ranges, start))
+            if answer is None:
+                return
+            yield answer[0]
 
     def turns_to(
         self, target: Pose, base: Pose, positions: Mapping[str, float], bounds: Mapping[str, Bounds]

@@ -89,15 +89,32 @@ def solve(
             target is in another frame or not finite.
         MissingExtra: the arm has no closed form, and the library for other arms is not installed.
     """
+    return next(postures(robot, arm, target, base=base, torso_height=torso_height, limits=limits))
+
+
+def postures(
+    robot: Object,
+    arm: Arms,
+    target: Pose,
+    *,
+    base: Pose | None = None,
+    torso_height: float | None = None,
+    limits: Limits = Limits.SOFT,
+) -> Iterator[dict[str, float]]:
+    """Yield what `solve` returns, then further postures for the target, with which an arm may be clear of obstacles.
+
+    An arm with a closed form has one: that farthest from all limits. Raises what `solve` raises, before the first.
+    """
     description = robot.robot_description
     if description is None:
         raise CallerError(f"{robot.name!r} has no robot description, so its arms are unknown")
     root = robot.root_pose(base)
     if not isinstance(description, PR2Description):
-        return _solve_chain(robot, description, arm, target, root, torso_height, limits)
+        yield from _chain_postures(robot, description, arm, target, root, torso_height, limits)
+        return
     height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
     narrower = robot.joint_limits if limits is Limits.HARD else None
-    return solve_from(description, arm, target, base=root, torso_height=height, limits=limits, narrower=narrower)
+    yield solve_from(description, arm, target, base=root, torso_height=height, limits=limits, narrower=narrower)
 
 
 def solve_from(
@@ -129,7 +146,7 @@ def solve_from(
     return _solve(arm_description, arm, target, reach, bounds, limits)
 
 
-def _solve_chain(
+def _chain_postures(
     robot: Object,
     description: RobotDescription,
     arm: Arms,
@@ -137,8 +154,8 @@ def _solve_chain(
     root: Pose,
     torso_height: float | None,
     limits: Limits,
-) -> dict[str, float]:
-    """Solve for a robot without a closed form, whose root link is at `root`."""
+) -> Iterator[dict[str, float]]:
+    """Yield the postures of a robot without a closed form, whose root link is at `root`."""
     arm_description = _one_arm(description.arms, description, arm)
     _check(target, root)
     chain = chain_of(robot, arm)
@@ -146,18 +163,17 @@ def _solve_chain(
     if torso_height is not None and description.torso_joint is not None:
         positions[description.torso_joint] = torso_height
     goal = target.relative_to(root)
-    distance = chain.distance_m(goal, positions)
-    if distance > chain.reach_m:
-        raise Unreachable(
-            target, arm, f"too far: {distance:.3f} m from its first joint, it reaches {chain.reach_m:.3f} m"
-        )
-    joints = chain.solve(goal, positions, _chain_bounds(chain, arm_description, limits))
-    if joints is not None:
+    if (beyond := chain.beyond(goal, positions)) is not None:
+        raise Unreachable(target, arm, "too far: {:.3f} m from its first joint, it reaches {:.3f} m".format(*beyond))
+    is_reached = False
+    for joints in chain.postures(goal, positions, _chain_bounds(chain, arm_description, limits)):
         reached = chain.forward(positions | joints)
         turned = _angle_between(reached.orientation, goal.orientation) if chain.held is Held.ALL else 0.0
         if reached.distance(goal) <= EXACT_M and turned <= EXACT_RAD:
-            return joints
-    raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
+            is_reached = True
+            yield joints
+    if not is_reached:
+        raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
 
 
 def within_reach(

@@ -6,7 +6,8 @@ link is its origin, so that Bullet, which places links by their centres of mass,
 **PR2.** It has the links, joints, hard limits and dimensions of the real one as far as plans use them; the rolls of
 forearm and wrist are continuous. Its root link `base_footprint` is on the floor. The shapes are about as large as the
 robot's: precise enough for bounding boxes, rays and pictures. The optional package example-robot-data has a PR2 of
-meshes (`pr2_mesh_urdf_path`) with narrower limits of two joints (wrist flex -2.094 rad, torso 0.31 m).
+meshes (`pr2_mesh_urdf_path`) with narrower limits of two joints (wrist flex -2.094 rad, torso 0.31 m), and the model
+of the TIAGo Pro.
 
 **Courier.** A small robot of our own design: a differential base carries a column; an arm of six joints is mounted at
 its front, a camera on its top. With all joints 0 the arm points ahead, along x.
@@ -152,8 +153,8 @@ def built_in_urdf(name: str, object_type: ObjectType) -> str:
             return built_in_model(name)
         raise DescriptionNotLoadable(
             name,
-            f"no {object_type.name} of that name is built in ('pr2', 'courier' are robots, 'kitchen' the environment); "
-            "pass a description: URDF text or the path of a .urdf file",
+            f"no {object_type.name} of that name is built in ('pr2', 'courier' and, with the extra [pr2], 'tiago_pro' "
+            "are robots, 'kitchen' the environment); pass a description: URDF text or the path of a .urdf file",
         )
     return _SHAPES[object_type](_NOT_IN_XML.sub("_", name))
 
@@ -178,7 +179,7 @@ def built_in_model(name: str) -> str:
     return Path(__file__).with_name("built_in").joinpath(f"{name}.urdf").read_text(encoding="utf-8")
 
 
-_MESH_MODEL = "cmeel.prefix/share/example-robot-data/robots/pr2_description/urdf/pr2.urdf"
+_MESH_MODELS = "cmeel.prefix/share/example-robot-data/robots/"
 
 
 def pr2_mesh_urdf_path() -> Path:
@@ -189,12 +190,21 @@ def pr2_mesh_urdf_path() -> Path:
     Raises:
         MissingExtra: the package, or the model in it, is not installed.
     """
+    return _mesh_model("PR2", "pr2_description/urdf/pr2.urdf", ", or use the built-in model")
+
+
+def tiago_pro_urdf_path() -> Path:
+    """Return the path of the TIAGo Pro's model in the same package. Raises `MissingExtra` if it is not installed."""
+    return _mesh_model("TIAGo Pro", "tiago_pro_description/robots/tiago_pro.urdf")
+
+
+def _mesh_model(robot: str, file: str, otherwise: str = "") -> Path:
     try:
-        path = Path(str(distribution("example-robot-data").locate_file(_MESH_MODEL)))
+        path = Path(str(distribution("example-robot-data").locate_file(_MESH_MODELS + file)))
     except PackageNotFoundError:
         raise MissingExtra(
-            "the PR2's mesh model is not installed: pip install 'pycrorm-async[pr2]', or use the built-in model"
+            f"the {robot}'s mesh model is not installed: pip install 'pycrorm-async[pr2]'{otherwise}"
         ) from None
     if not path.is_file():
-        raise MissingExtra(f"example-robot-data contains no PR2 at {path}: pip install 'pycrorm-async[pr2]'")
+        raise MissingExtra(f"example-robot-data contains no {robot} at {path}: pip install 'pycrorm-async[pr2]'")
     return path

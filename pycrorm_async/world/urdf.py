@@ -23,6 +23,7 @@ import logging
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -30,7 +31,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.world.models import tiago_pro_urdf_path
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, JointType, Pose, Quaternion, Vector
 from pycrorm_async.world.urdf_model import ENDLESS, Joint, Model, along, number_of, parsed_srdf, read_model, urdf_text
 from pycrorm_async.world.urdf_model import Bounds as Bounds  # one of the names of this module
@@ -163,13 +165,17 @@ class RobotDescription:
     """Camera height above the floor with the torso at its lowest and highest; None: the camera's current height."""
     postures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Joint positions by the name of the posture, for `MoveJointsMotion`, such as "carry"."""
+    approaches_along_fingers: bool = True
+    """Whether a hand approaches an object along the fingers as they are in the grasp, whatever the arm's posture was.
+    Otherwise it comes from behind along the fingers as they are before: of an arm parked with the hand up, from below,
+    through the table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PR2Description(RobotDescription):
     """A robot of the PR2's build, whose arms and head have closed forms: a lifting torso, and a head on its top.
 
-    Plans may use the whole range of the torso, also outside its soft limits.
+    Plans may use the whole range of the torso, also outside its soft limits. Its hands approach as in the thesis.
     """
 
     arms: Mapping[Arms, PR2Arm]
@@ -183,6 +189,7 @@ class PR2Description(RobotDescription):
     head_tilt_link: str
     camera_link: str
     camera_height_m: Bounds
+    approaches_along_fingers: bool = False
 
 
 FINGER_OPEN_RAD = 0.548
@@ -321,6 +328,41 @@ COURIER = RobotDescription(
 """A robot of another build than the PR2: one arm of six joints, no torso, a differential base."""
 
 
+TIAGO_PRO = "tiago_pro"
+"""The name of a TIAGo Pro of PAL Robotics, whose model and description need the package example-robot-data."""
+
+
+def _tiago_pro() -> RobotDescription:
+    """Describe the TIAGo Pro: an omnidirectional base, a torso that lifts, and two arms of seven joints.
+
+    Limits are those of the model; what the model lacks was measured in it. Raises `MissingExtra` without the package.
+    """
+    urdf = tiago_pro_urdf_path()
+    parked = (0.35, -1.85, 0.5, -2.35, 0.0, -1.2, 0.0)  # folded beside the torso, with the fingers up
+    arms = {}
+    for arm, side, sign in ((Arms.LEFT, "left", 1.0), (Arms.RIGHT, "right", -1.0)):
+        joints = (f"arm_{side}_{number}_joint" for number in range(1, 8))
+        mirrored = (position * sign if number % 2 == 0 else position for number, position in enumerate(parked))
+        described = describe_arm(
+            urdf,
+            "torso_lift_link",
+            f"arm_{side}_tool_link",
+            park=dict(zip(joints, mirrored, strict=True)),
+            tool_in_link=Pose((0.0, 0.0, 0.14), _unit(0, -1, 0, 1)),  # the fingers point along z
+        )
+        arms[arm] = replace(described, opening_m=0.079)
+    return describe_robot(
+        TIAGO_PRO,
+        urdf,
+        arms=arms,
+        torso_joint="torso_lift_joint",
+        head_joints=("head_1_joint", "head_2_joint"),
+        camera_link="head_front_camera_link",
+        camera_in_link=Pose(orientation=_unit(-1, 1, -1, 1)),  # x of the link points ahead, z up
+        camera_height_m=Bounds(1.16, 1.51),
+    )
+
+
 _registered: dict[str, RobotDescription] = {each.name: each for each in (PR2, COURIER)}
 """Descriptions by model, for the process: module state, because a plan's file registers its robots when it is loaded,
 before any world is entered, and also in each process that loads it for rollouts."""
@@ -352,7 +394,13 @@ def with_payload(
 
 
 def robot_description(name: str) -> RobotDescription | None:
-    """Return the built-in or registered description of that name; None if there is none."""
+    """Return the built-in or registered description of that name; None if there is none.
+
+    That of the TIAGo Pro is None where its model is not installed.
+    """
+    if name == TIAGO_PRO and name not in _registered:
+        with suppress(MissingExtra):
+            register_robot(_tiago_pro())
     return _registered.get(name)
 
 

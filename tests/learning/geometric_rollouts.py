@@ -26,7 +26,7 @@ def succeeds(choice: PickUpChoice, milk: Pose = MILK) -> bool:
     ahead = math.atan2(milk.position.y - floor.position.y, milk.position.x - floor.position.x)
     base = Pose(floor.position, yaw_quaternion(ahead))
     try:
-        for goal in pick_up_poses(milk, choice.grasp, base):
+        for goal in pick_up_poses(PR2, milk, choice.grasp, base):
             solve_from(PR2, choice.arm, goal, base=base, torso_height=choice.torso or 0.0)
     except Unreachable:
         return False

@@ -35,7 +35,12 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.failures import CapabilityAbsenceFailure, NavigationGoalInCollision, ReachabilityFailure
+from pycrorm_async.plan.failures import (
+    CapabilityAbsenceFailure,
+    ManipulationGoalInCollision,
+    NavigationGoalInCollision,
+    ReachabilityFailure,
+)
 from pycrorm_async.plan.motions import simulated_robot_within
 from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.plan.task import PastSuccess
@@ -345,3 +350,69 @@ async def test_driving_into_an_object_with_what_the_base_carries_is_refused() ->
         assert cargo.pose == Pose([0, 0, 2.0])
         await NavigateActionPerformable(Pose([2, 1, HEIGHT_M])).perform()
         assert cargo.pose.position == pytest.approx((2, 1, 2.0))
+
+
+# === tiago pro ================================================================================================
+#
+# A second robot does whole tasks: its arms park with the hands up, so an approach along them would come from the table.
+
+
+@pytest.fixture
+def tables() -> Iterator[Object]:
+    """A TIAGo Pro with parked arms between a table with milk and an empty one; collisions count."""
+    with BulletWorld(), simulated_robot_within(Limits.SOFT, collisions=True):
+        robot = Object("tiago_pro", ObjectType.ROBOT)
+        assert robot.robot_description is not None
+        for each in robot.robot_description.arms.values():
+            robot.set_joint_positions(dict(each.park))
+        robot.set_joint_position("torso_lift_joint", 0.3)
+        for number, x in enumerate((1.6, -1.6)):
+            Object(f"table {number}", ObjectType.ENVIRONMENT, TABLE, pose=Pose([x, 0, 0]))
+        Object("milk", ObjectType.MILK, pose=Pose([1.55, 0.1, 0.838]))
+        yield robot
+
+
+async def test_a_tiago_pro_fetches_an_object_from_one_table_and_places_it_on_another(tables: Object) -> None:
+    milk, goal = tables.world.object("milk"), Pose([-1.45, 0.2, 0.838], yaw_quaternion(2.0))
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    await MoveTorsoActionPerformable(0.25).perform()
+    place = CostmapLocation(milk, reachable_for=tables).resolve()
+    await NavigateActionPerformable(place.pose).perform()
+    await LookAtActionPerformable(milk.pose).perform()
+    assert (await DetectActionPerformable(milk).perform()).name == "milk"
+    await TransportActionPerformable(milk, place.reachable_arms[0], goal).perform()
+    assert milk.pose.distance(goal) < 1e-5
+    assert milk.attached_to is None
+
+
+async def test_a_hand_that_is_parked_up_approaches_along_the_fingers_of_the_grasp(tables: Object) -> None:
+    milk, robot = tables.world.object("milk"), require_robot()
+    assert rotated(robot.tool_pose(Arms.LEFT).orientation, (1, 0, 0)).z > 0.7
+    await NavigateActionPerformable(Pose([0.75, 0, 0])).perform()
+    with pytest.raises(ManipulationGoalInCollision, match="would be in table 0"):
+        tables.robot_description = replace(robot.description, approaches_along_fingers=False)
+        await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
+    tables.robot_description = robot.description
+    await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
+    assert milk in tables.attachments
+
+
+def test_the_parked_arms_of_a_tiago_pro_are_beside_its_torso_and_mirrored(tables: Object) -> None:
+    boxes = []
+    for arm in require_robot().description.arms.values():
+        links = [each for each in tables.links if arm.joints[0] in tables.joints_above(each)]
+        box = tables.body.box(links)
+        assert box is not None
+        boxes.append(
+            (box.min.x, box.max.x, min(map(abs, (box.min.y, box.max.y))), max(map(abs, (box.min.y, box.max.y))))
+        )
+    assert boxes[0] == pytest.approx(boxes[1], abs=0.01)
+    assert boxes[0] == pytest.approx((-0.07, 0.36, 0.12, 0.30), abs=0.02)
+
+
+async def test_a_gripper_of_a_tiago_pro_refuses_what_is_wider_than_its_pads_are_apart(tables: Object) -> None:
+    cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.45, -0.3, 0.85]))
+    await NavigateActionPerformable(Pose([0.7, -0.3, 0])).perform()
+    wide = PickUpActionPerformable(cereal, Arms.RIGHT, Grasp.LEFT)
+    await fails(wide, "0.148 m wide between the fingers, the RIGHT gripper opens 0.079 m")
+    await PickUpActionPerformable(cereal, Arms.RIGHT, Grasp.FRONT).perform()

@@ -410,7 +410,10 @@ def test_a_description_that_cannot_be_loaded_is_refused_with_the_reason(world: B
 def test_a_robot_or_environment_that_is_not_built_in_needs_a_description(
     world: BulletWorld, object_type: ObjectType
 ) -> None:
-    with pytest.raises(DescriptionNotLoadable, match="'pr2', 'courier' are robots, 'kitchen' the environment"):
+    with pytest.raises(
+        DescriptionNotLoadable,
+        match=r"'pr2', 'courier' and, with the extra .pr2., 'tiago_pro' are robots, 'kitchen' the environment",
+    ):
         Object("somewhere", object_type)
     assert Object("somewhere", object_type, CRANE).robot_description is None
 
