@@ -110,9 +110,11 @@ class TransportPolicy:
         action = MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
         action.keep_policy()
         obj = objects.in_world(target)
-        region, context = free_and_visible(objects.require_robot(), obj), action.context_for(self.policy)
+        robot = objects.require_robot()
+        region, context = free_and_visible(robot, obj), action.context_for(self.policy)
         holds = [hold for hold in product(arms, Grasp) if takes(*hold)]
-        goals = [geometry.pick_up_poses(obj.pose, grasp, Pose())[1:] for _, grasp in holds]
+        known = 0 if robot.description.approaches_along_fingers else 1  # of others the first depends on the base
+        goals = [geometry.pick_up_poses(robot.description, obj.pose, grasp, Pose())[known:] for _, grasp in holds]
         weights: dict[int, float] = {}
         tried: list[PickUpChoice] = []
         for _ in range(FETCHING_SEARCHES if holds else 0):

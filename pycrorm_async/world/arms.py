@@ -326,16 +326,14 @@ class Chain:
         """Return the position of the first joint of the arm in the root link, with that joint at 0."""
         return along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)}).position
 
-    def beyond(self, target: Pose, positions: Mapping[str, float]) -> tuple[float, float] | None:
-        """Return how far a target in the root link is from the first joint of the arm, and the reach; None within it.
+    def held_point(self, target: Pose) -> tuple[Vector, float]:
+        """Return the point at which a target holds the arm, and its greatest distance from the first joint, m.
 
-        An arm that holds the whole orientation has its last joint, the wrist, at one point: that must be within reach.
+        Of an arm that holds the whole orientation it is the last joint, the wrist, of any other the tool.
         """
-        end, reach_m = target, self.reach_m
         if self.held is Held.ALL:
-            end, reach_m = target @ self._behind.inverse(), self._wrist_reach_m
-        distance_m = math.dist(self.first_joint(positions), end.position)
-        return (distance_m, reach_m) if distance_m > reach_m else None
+            return (target @ self._behind.inverse()).position, self._wrist_reach_m
+        return target.position, self.reach_m
 
     def postures(
         self, target: Pose, positions: Mapping[str, float], bounds: Mapping[str, Bounds]

@@ -163,8 +163,10 @@ def _chain_postures(
     if torso_height is not None and description.torso_joint is not None:
         positions[description.torso_joint] = torso_height
     goal = target.relative_to(root)
-    if (beyond := chain.beyond(goal, positions)) is not None:
-        raise Unreachable(target, arm, "too far: {:.3f} m from its first joint, it reaches {:.3f} m".format(*beyond))
+    point, reach_m = chain.held_point(goal)
+    distance = math.dist(chain.first_joint(positions), point)
+    if distance > reach_m:
+        raise Unreachable(target, arm, f"too far: {distance:.3f} m from its first joint, it reaches {reach_m:.3f} m")
     is_reached = False
     for joints in chain.postures(goal, positions, _chain_bounds(chain, arm_description, limits)):
         reached = chain.forward(positions | joints)
@@ -191,18 +193,20 @@ def within_reach(
     """
     description = robot.robot_description
     assert description is not None, "a robot that searches has a description"
-    ranges, offset, behind, firsts = (0.0, math.inf), 0.0, 0.0, []
+    ranges, offset, firsts = (0.0, math.inf), 0.0, []
     if isinstance(description, PR2Description):
         described = _one_arm(description.arms, description, arm)
         bounds, names = _bounds(described, limits), described.joints
         if limits is Limits.HARD:
             bounds = [_narrow(each, robot.joint_limits(name)) for name, each in zip(names, bounds, strict=True)]
-        ranges, offset, behind = arm_ik.stretches_m(described, bounds), described.shoulder_offset_m, described.tool_m
+        ranges, offset = arm_ik.stretches_m(described, bounds), described.shoulder_offset_m
+        wrists = [(each @ Pose((-described.tool_m, 0.0, 0.0))).position for each in targets]
         now = robot.joint_position(description.torso_joint)
         firsts = [_shoulder(description, described, now if each is None else each) for each in torso_heights]
     else:
         chain, positions, torso = chain_of(robot, arm), robot.joint_positions(), description.torso_joint
-        ranges = 0.0, chain.reach_m
+        held = [chain.held_point(each) for each in targets]
+        wrists, ranges = [point for point, _ in held], (0.0, max(reach_m for _, reach_m in held))
         for height in torso_heights:
             lifted = {} if torso is None or height is None else {torso: height}
             firsts.append(chain.first_joint(positions | lifted))
@@ -212,9 +216,8 @@ def within_reach(
     first = at + _turned(turns, np.array([(root @ Pose(each)).position for each in firsts]))
     up = _turned(turns, np.array(rotated(root.orientation, (0.0, 0.0, 1.0))))
     reached = np.ones((len(bases), len(torso_heights)), dtype=bool)
-    for each in targets:
-        ahead = rotated(each.orientation, (1.0, 0.0, 0.0))
-        way = np.array(each.position) - behind * np.array(ahead) - first
+    for each in wrists:
+        way = np.array(each) - first
         height = (way * up).sum(axis=-1)
         across = np.sqrt(np.maximum((way**2).sum(axis=-1) - height**2, 0.0))
         reached &= np.hypot(across - offset, height) <= ranges[1] + EXACT_M
