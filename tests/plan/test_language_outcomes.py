@@ -43,9 +43,6 @@ from tests.plan.fakes import Around, Step, drawn, failing
 #
 # Results and failures of expressions: nested, alternative, concurrent and repeated.
 
-# --- errors of the reference system -----------------------------------------------------------------------------------
-
-
 # --- outcomes ---------------------------------------------------------------------------------------------------------
 
 

@@ -389,11 +389,3 @@ async def test_an_object_that_cannot_be_delivered_stays_in_the_hand(scene: Scene
         await TransportActionPerformable(scene.milk, Arms.LEFT, Pose([0, -3, 3.0])).perform()
     assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
     assert parked(scene, Arms.LEFT, Arms.RIGHT)
-
-
-async def test_a_robot_of_one_arm_transports_with_it(scene: Scene, one_armed: None) -> None:
-    await MoveTorsoActionPerformable(0.3).perform()
-    await TransportActionPerformable(scene.milk, Arms.LEFT, ISLAND).perform()
-    np.testing.assert_allclose(matrix(scene.milk.pose), matrix(ISLAND), atol=1e-6)
-    assert parked(scene, Arms.LEFT)
-    assert not parked(scene, Arms.RIGHT)

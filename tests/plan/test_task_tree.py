@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 import re
-from collections.abc import Awaitable
 from dataclasses import dataclass, field
 
 import pytest
@@ -222,13 +221,6 @@ async def test_the_thesis_plan_puts_the_cereal_on_the_island(scene: Scene) -> No
     assert (scene.cereal.attached_to, scene.milk.pose.position) == (None, (1.3, 1, 0.9))
     assert re.sub(r" SUCCEEDED \d+\.\d ms", "", str(tree)) == TREE
     assert {node.status for node in tree} == {TaskStatus.SUCCEEDED}
-
-
-class Alternating(Recording):
-    """Let other tasks run before every node."""
-
-    def admit(self) -> Awaitable[None]:
-        return asyncio.sleep(0)
 
 
 async def test_two_runs_of_the_plan_are_the_same(scene: Scene) -> None:

@@ -108,28 +108,6 @@ async def test_a_deleted_folder_is_neither_taken_nor_made_again(spool: Path) -> 
 # --- stored records ---------------------------------------------------------------------------------------------------
 
 
-async def test_another_drainer_continues_after_the_visible_records(offered: RecorderQueue) -> None:
-    offered.put_nowait(started(), b"{}")
-    fill(offered)
-    await offered.synced_to()
-    source = take(offered)
-    await next_positions(source, events_max=7)
-    await source.acknowledge(6)
-    source.mark_visible(5, {})
-    source.release()
-    await eventually(lambda: segments(offered)[0] == "00000002.segment")  # it holds records 5 to 8
-    source = take(offered)
-    assert await next_positions(source, events_max=100) == list(range(6, 2 + ORDINARY))
-    assert source.stored == 6
-    await source.acknowledge(1 + ORDINARY)
-    source.mark_visible(1 + ORDINARY, {})
-    source.release()
-    source = take(offered)
-    offered.put_nowait(ended(), b"{}")
-    assert await next_positions(source) == [2 + ORDINARY]
-    source.release()
-
-
 async def test_a_full_spool_that_another_process_drains_wakes_the_producers(offered: RecorderQueue) -> None:
     offered.put_nowait(started(), b"{}")
     assert fill(offered) == ORDINARY

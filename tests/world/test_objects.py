@@ -50,21 +50,6 @@ def test_the_pose_read_is_exactly_the_pose_set(world: BulletWorld) -> None:
 
 
 @pytest.mark.parametrize("base", [Pose(), LEANING])
-@pytest.mark.parametrize(
-    ("turning", "lifting", "reaching"), [(0, 0, 0), (0.4, -0.5, 0.6), (-9.0, 1.2, 0.25), (2.5, 0.3, 0)]
-)
-def test_every_link_is_where_the_description_has_it(
-    world: BulletWorld, base: Pose, turning: float, lifting: float, reaching: float
-) -> None:
-    placed_crane = crane(base)
-    placed_crane.set_joint_positions({"turning": turning, "lifting": lifting, "reaching": reaching})
-    expected = crane_links(base, turning=turning, lifting=lifting, reaching=reaching)
-    assert set(placed_crane.links) == set(expected)
-    for link, where in expected.items():
-        np.testing.assert_allclose(matrix(placed_crane.link_pose(link)), where, atol=1e-9)
-
-
-@pytest.mark.parametrize("base", [Pose(), LEANING])
 def test_a_link_pose_at_other_joint_positions_moves_nothing_and_notifies_no_observer(
     world: BulletWorld, base: Pose
 ) -> None:
