@@ -9,8 +9,7 @@ again.
 ...     await performable_of(rows[0]).perform()
 
 The row's attributes have all values except the objects themselves, which are searched by name in the current world. A
-list that could not be recorded has no entries, like an empty one. A query with `undefer(Action.parameters)`
-distinguishes them, and errors then name the reason why a value is missing.
+list that could not be recorded has no entries, like an empty one.
 
 **Recorded world.** Make a world with the objects of a snapshot, at the poses, joint positions and attachments of that
 moment.
@@ -46,7 +45,6 @@ from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.plan import objects
 from pycrorm_async.plan.field_types import ARGUMENTS
 from pycrorm_async.plan.language import Designator
-from pycrorm_async.projections.row_batch import is_missing
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.record.declarations import FieldShape, shape_of
 from pycrorm_async.record.plan_types import Parameter, Unresolved, declared_type, parameters_of
@@ -70,7 +68,7 @@ def performable_of(row: orm.Designator, /, **replacements: Any) -> Designator:
 
     Its class is the imported one with the row's dtype or alias. A designator inside another is made like a nested
     dataclass. Objects are those of the current world with the recorded names; believed objects, located objects and
-    frozen copies have the recorded pose. An optional list without entries is None unless `parameters` are loaded.
+    frozen copies have the recorded pose. An optional list without entries is None.
 
     Args:
         row: as a session of the memory returns it.
@@ -153,20 +151,12 @@ class _RowReader:
     def __init__(self, row: orm.Designator, names_in_rows: Mapping[str, str]) -> None:
         self._row = row
         self._names_in_rows = names_in_rows
-        self._parameters: Mapping[str, Any] = vars(row).get("_parameters", {})  # empty unless the query loads them
 
     def missing(self, names: tuple[str, ...], reason: str) -> NotPerformable:
-        name = "_".join(names)
-        recorded = self._names_in_rows.get(name, name)
-        if self._is_missing(recorded):
-            reason = f"it was not recorded, because {self._parameters[recorded]['missing']}"
         return NotPerformable(
-            f"row {self._row.id} of {self._row.dtype} has no value for {name!r}: {reason}; pass one, as in"
+            f"row {self._row.id} of {self._row.dtype} has no value for {'_'.join(names)!r}: {reason}; pass one, as in"
             f" performable_of(row, {names[0]}=…)"
         )
-
-    def _is_missing(self, name: str) -> bool:
-        return is_missing(self._parameters.get(name))
 
     def value(self, parameter: Parameter, outer: tuple[str, ...]) -> Any:
         """Return the parameter's value, converted to its declared type. Raises `NotPerformable`."""
@@ -179,8 +169,6 @@ class _RowReader:
         if shape.nested is not None:
             return self._nested(shape.nested, names, optional=shape.optional)
         if shape.kind in ("list", "dict"):
-            if self._is_missing(name):
-                raise self.missing(names, "it was not recorded")
             return self._container(name, parameter.hint, shape)
         owner = next((each for each in type(self._row).__mro__ if name in vars(each)), None)
         if owner is None:
@@ -188,7 +176,7 @@ class _RowReader:
         if issubclass(orm.Designator, owner):
             raise self.missing(names, "every row has another attribute of this name")
         value = getattr(self._row, name)
-        if value is None and (not shape.optional or self._is_missing(name)):
+        if value is None and not shape.optional:
             raise self.missing(names, "it was not recorded")
         return _converted(value, parameter.hint, shape.enum)
 
@@ -214,7 +202,7 @@ class _RowReader:
         else:
             items = (_converted(value, arguments[0], shape.enum) for value in self._row.entries(name))
             values = tuple(items) if typing.get_origin(container) is tuple else list(items)
-        return values if values or not shape.optional or name in self._parameters else None
+        return values if values or not shape.optional else None
 
 
 def _converted(value: Any, hint: Any, enum: type[Enum] | None) -> Any:

@@ -191,8 +191,7 @@ async def align_runs(reading: EpisodeReader, episodes: Sequence[AskedEpisode]) -
     by_number = {number: _by_path(await reading.tree(each)) for number, each in runs.items()}
     nodes = [
         AlignedNode(
-            path,
-            {number: tree.get(path) for number, tree in by_number.items() if len(path) == 1 or path[:-1] in tree},
+            path, {number: tree.get(path) for number, tree in by_number.items() if len(path) == 1 or path[:-1] in tree}
         )
         for path in _united(by_number.values())
     ]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, Union
 
 from sqlalchemy import CompoundSelect, Dialect, Row, Select, func, select
 
-from pycrorm_async.errors import CallerError, InternalError, QueryRefused, UnknownEpisode
-from pycrorm_async.events.ids import number_in
+from pycrorm_async.errors import CallerError, InternalError, QueryRefused
+from pycrorm_async.events.ids import is_episode_id, number_in
 from pycrorm_async.orm import DesignatorType, Detection, EpisodeRobot, EpisodeTag, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.query.frames import EpisodeNumber, is_named
@@ -34,8 +34,6 @@ FrameQuery: TypeAlias = (
     "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question | SyncQuestion"
 )
 """A query that has a frame: a select, a union of selects, a mapped class, whose rows are all meant, or a question."""
-_DIGITS_OF_ID = 4
-"""Fewer digits are a number and not the first ones of an id, as in `store.log`."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,7 @@ class Question(NotebookValue):
     def statement(self) -> Select[*tuple[Any, ...]]:
         """The select, to change or to join. It contains the subquery that finds the named episode.
 
-        It has no row if no id, or more than one, begins with these digits, because a select cannot raise errors on all
-        databases; `rows` and `frame` raise `UnknownEpisode` then. It raises that itself for a text of fewer than four
-        characters that is no number or begins with a zero: to name an id takes four.
+        Raises `CallerError` for the first digits of an id, which only `rows` and `frame` look up.
         """
         episode = self._plan.episode
         return self._plan.select_of(episode=None if episode is None else _number_by_query(episode))
@@ -215,17 +211,11 @@ def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
     name, numbered = episode_name(episode), ProcessMetaData
     if name == "last":
         return select(func.max(numbered.id)).where(~numbered.simulated).scalar_subquery()
-    number = number_in(name)
-    if number is not None and (isinstance(episode, int) or len(name) < _DIGITS_OF_ID):
+    if (number := number_in(name)) is not None:
         return number
-    if len(name) < _DIGITS_OF_ID:
-        raise UnknownEpisode(f"there is no episode {name!r}; `pycrorm episodes` lists all")
-    is_named = numbered.uuid.startswith(name.lower(), autoescape=True)
-    # Without HAVING, SQLite would take the first of several episodes, and PostgreSQL refuse the select.
-    begins = select(func.min(numbered.id)).where(is_named).having(func.count() == 1).scalar_subquery()
-    if number is None:
-        return begins
-    return func.coalesce(select(numbered.id).where(numbered.id == number).scalar_subquery(), begins)
+    if not is_episode_id(name.lower()):
+        raise CallerError(f"a statement names an episode by its number, its whole id or `last`, got {name!r}")
+    return select(numbered.id).where(numbered.uuid == name.lower()).scalar_subquery()
 
 
 # === ports ====================================================================================================

@@ -226,21 +226,11 @@ class Reading:
 
     @overload
     async def dataframe(
-        self,
-        statement: FrameQuery,
-        *,
-        to: Library,
-        simulated: bool = False,
-        deferred: bool = False,
+        self, statement: FrameQuery, *, to: Library, simulated: bool = False, deferred: bool = False
     ) -> Any: ...
 
     async def dataframe(
-        self,
-        statement: FrameQuery,
-        *,
-        to: Library = "pandas",
-        simulated: bool = False,
-        deferred: bool = False,
+        self, statement: FrameQuery, *, to: Library = "pandas", simulated: bool = False, deferred: bool = False
     ) -> Any:
         """Return the rows as a frame of pandas, polars or Arrow, typed as the columns are declared.
 

@@ -64,13 +64,7 @@ async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[lis
     rows = (await connection.execute(query)).all()
     robots = await robots_of(connection, [each.id for each in rows])
     episodes = [
-        RunningEpisode(
-            each.id,
-            each.uuid,
-            utc_of(each.created_at),
-            each.description,
-            tuple(robots.get(each.id, ())),
-        )
+        RunningEpisode(each.id, each.uuid, utc_of(each.created_at), each.description, tuple(robots.get(each.id, ())))
         for each in rows
     ]
     return episodes, rows[0].total if rows else 0

@@ -224,8 +224,7 @@ def _block(groups: Sequence[Group], left_out: frozenset[str] = frozenset()) -> C
     left_out |= {name for name, each in words.items() if each.word_count > WORDS_MAX}
     united = (
         replace(
-            group,
-            texts={name: each.recoded(words[name]) for name, each in group.texts.items() if name not in left_out},
+            group, texts={name: each.recoded(words[name]) for name, each in group.texts.items() if name not in left_out}
         )
         for group in groups
     )

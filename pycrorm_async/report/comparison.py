@@ -120,11 +120,7 @@ def _tree_document(aligned: AlignedRuns) -> dict[str, Any]:
 
     first = aligned.first_parting
     nodes = [[len(each.path) - 1, each.name, int(each is first), ways_of(each)] for each in shown]
-    return {
-        "outcomes": [*outcomes],
-        "nodes": nodes,
-        "left": len(aligned.nodes) - len(shown),
-    }
+    return {"outcomes": [*outcomes], "nodes": nodes, "left": len(aligned.nodes) - len(shown)}
 
 
 def _start(node: NodeSummary | None) -> int:

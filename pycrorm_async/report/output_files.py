@@ -45,8 +45,7 @@ def write_file(content: bytes, path: Path, *, force: bool = False) -> None:
 def new_file(path: Path, *, force: bool) -> Iterator[Path]:
     """Yield the name of an empty file beside `path`, and rename it to `path` at the end unless an error occurred.
 
-    Raises `CallerError` as `refuse_existing`, also if another process made the file meanwhile, and for a folder;
-    `OSError` if the disk is full.
+    Raises `CallerError` as `refuse_existing`, again at the end, and for a folder; `OSError` if the disk is full.
     """
     refuse_existing(path, force=force)
     _delete_parts(path)
@@ -57,13 +56,9 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
         yield written
         written.chmod(0o666 & ~_umask())
         _sync(written)
-        if force:
-            written.replace(path)
-        else:
-            _rename_to_new(written, path)
+        refuse_existing(path, force=force)  # another process may have made it meanwhile
+        written.replace(path)
         _sync(path.absolute().parent)
-    except FileExistsError:
-        raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
     except OSError as error:
         raise _named_after(error, path, written) from error
     finally:
@@ -112,17 +107,6 @@ def _named_after(error: OSError, path: Path, part: Path) -> OSError:
     name = error.filename
     is_of_part = name is None or Path(os.fsdecode(name)).is_relative_to(part)
     return OSError(error.errno, error.strerror, str(path)) if is_of_part else error
-
-
-def _rename_to_new(written: Path, path: Path) -> None:
-    """Give the file its name; unlike a renaming, raise `FileExistsError` if another process made it meanwhile."""
-    try:
-        path.hardlink_to(written)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links, such as that of a USB stick
-        path.touch(exist_ok=False)
-        written.replace(path)
 
 
 def _prefix(path: Path) -> str:

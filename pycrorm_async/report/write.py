@@ -208,8 +208,6 @@ COUNTED: Final = 20
 """The cases among which successes and reasons are counted."""
 _LISTED_MAX: Final = 12
 """Bounds the features of a case that are listed as alike, and as different; those that weigh most are taken."""
-_CHARACTERS_MAX: Final = 2_000_000
-"""Bounds the characters of all listed features of a page, of which most are shared by many cases."""
 _FAILED_STATUSES = ("FAILED", "ERROR")
 
 
@@ -246,35 +244,18 @@ class SimilarCases:
         library = self._library
         cases = _cases_of(library, episode, starts)
         nodes: dict[str, dict[str, Any]] = {}
-        texts = _Texts()
+        texts: dict[str, int] = {}
         for group, row in cases[: self._actions_max(len(library))]:
-            if texts.characters > _CHARACTERS_MAX:
-                break
             case = group.case(row)
             nodes[str(case.sequence)] = _entry(_earlier(case, library), texts)
         mentioned = {each[0] for entry in nodes.values() for each in entry["cases"]}
         pages = {str(each): page_name(each) for each in sorted(mentioned & self._pages - {episode})}
-        return {"actions": len(cases), "pages": pages, "texts": [*texts.numbers], "nodes": nodes}
+        return {"actions": len(cases), "pages": pages, "texts": [*texts], "nodes": nodes}
 
     def _actions_max(self, cases: int) -> int:
         """Return the number of actions of a page to compare, in a memory with this many cases."""
         bound = _COMPARED_MAX // max(cases, 1) // max(len(self._pages), 1)
         return min(ACTIONS_MAX, max(ACTIONS_MIN, bound))
-
-
-class _Texts:
-    """Texts by number, each once."""
-
-    def __init__(self) -> None:
-        self.numbers: dict[str, int] = {}
-        self.characters = 0
-
-    def all(self, texts: Sequence[str]) -> list[int]:
-        for each in texts:
-            if each not in self.numbers:
-                self.numbers[each] = len(self.numbers)
-                self.characters += len(each)
-        return [self.numbers[each] for each in texts]
 
 
 def _cases_of(library: CaseLibrary, episode: int, starts: Collection[int]) -> list[tuple[Group, int]]:
@@ -294,7 +275,7 @@ def _earlier(case: Case, library: CaseLibrary) -> Answer:
     return answer(replace(cue_like(case, library), before_us=case.started_us, k=COUNTED), library)
 
 
-def _entry(similar: Answer, texts: _Texts) -> dict[str, Any]:
+def _entry(similar: Answer, texts: dict[str, int]) -> dict[str, Any]:
     reasons = ", ".join(f"{name} {count}" for name, count in similar.reasons)
     success = similar.success
     return {
@@ -304,8 +285,8 @@ def _entry(similar: Answer, texts: _Texts) -> dict[str, Any]:
     }
 
 
-def _case(recalled: RecalledCase, texts: _Texts) -> list[Any]:
-    """Return a case as `web/panels.js` reads it."""
+def _case(recalled: RecalledCase, texts: dict[str, int]) -> list[Any]:
+    """Return a case as `web/panels.js` reads it, with its features as numbers of `texts`."""
     case = recalled.case
     return [
         case.episode,
@@ -314,8 +295,8 @@ def _case(recalled: RecalledCase, texts: _Texts) -> list[Any]:
         case.status,
         case.reason or "",
         f"{case.started_at:%Y-%m-%d %H:%M:%S}",
-        texts.all(_listed(recalled.matched, _alike)),
-        texts.all(_listed(recalled.missed, _differs)),
+        [texts.setdefault(each, len(texts)) for each in _listed(recalled.matched, _alike)],
+        [texts.setdefault(each, len(texts)) for each in _listed(recalled.missed, _differs)],
     ]
 
 

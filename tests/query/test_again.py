@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 from sqlalchemy import select
-from sqlalchemy.orm import undefer
 
 from pycrorm_async import Memory, performable_of, world_of
 from pycrorm_async.errors import CallerError
@@ -134,14 +133,13 @@ def cooking(scene: Lab) -> CookActionPerformable:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [(), (undefer(Designator.parameters),)])
-async def test_every_kind_of_parameter_is_restored(tmp_path: Path, options: tuple[Any, ...]) -> None:
+async def test_every_kind_of_parameter_is_restored(tmp_path: Path) -> None:
     async with recorded(tmp_path):
         with lab() as scene:
             cooked = cooking(scene)
             await cooked.perform()
             scene.milk.set_pose(Pose([9, 9, 9]))
-    (row,) = await results_of(tmp_path, select(Action).options(*options))
+    (row,) = await results_of(tmp_path, select(Action))
     with lab() as again:
         again.cereal.set_pose(Pose([7, 7, 7]))
         designator = performable_of(row)
@@ -173,10 +171,7 @@ async def test_every_kind_of_parameter_is_restored(tmp_path: Path, options: tupl
 @pytest.mark.slow
 async def test_arguments_of_a_class_that_is_no_dataclass_are_restored_and_may_be_replaced(tmp_path: Path) -> None:
     async with recorded(tmp_path):
-        for mixed in (
-            MixActionPerformable("a", 1, 2, speed=0.5, sugar="much"),
-            MixActionPerformable("b"),
-        ):
+        for mixed in (MixActionPerformable("a", 1, 2, speed=0.5, sugar="much"), MixActionPerformable("b")):
             await mixed.perform()
     first, second = await results_of(tmp_path, select(Action).order_by(Action.id))
     assert performable_of(first).everything == ("a", (1, 2), 0.5, {"sugar": "much"})  # type: ignore[attr-defined]
@@ -200,40 +195,30 @@ async def test_a_motion_is_restored_with_its_joints(tmp_path: Path) -> None:
 @dataclass
 class StrangeActionPerformable(ActionAbstract):
     kind_of_thing: str
-    numbers: list[float]
-    number: float | None
+    number: float
     anything: Any = None
 
     async def perform(self) -> None:
         """Succeed without doing anything."""
 
 
-async def strange_row(folder: Path, *options: Any) -> Any:
-    """Return the row of an action whose fields were recorded as missing."""
-    async with Memory.open(url_of(folder)) as memory:
-        async with memory.episode():
-            await StrangeActionPerformable("odd", [float("nan")], float("inf"), object()).perform()
-        await memory.flush()
-    (row,) = await results_of(folder, select(Action).options(*options))
-    return row
-
-
 @pytest.mark.slow
-async def test_a_parameter_that_was_not_recorded_is_named_with_the_reason_and_may_be_passed(tmp_path: Path) -> None:
-    row = await strange_row(tmp_path, undefer(Action.parameters))
+async def test_a_parameter_that_was_not_recorded_is_named_and_may_be_passed(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode():
+            await StrangeActionPerformable("odd", float("inf"), object()).perform()
+        await memory.flush()
+    (row,) = await results_of(tmp_path, select(Action))
     passed: dict[str, Any] = {}
-    for name, reason in (
-        ("numbers", "it was not recorded, because nan is not a finite number"),
-        ("number", "it was not recorded, because inf is not a finite number"),
-        ("anything", "it was not recorded, because has the type Any"),
-    ):
+    for name, reason in (("number", "it was not recorded"), ("anything", "its type has no column")):
         with pytest.raises(NotPerformable) as refused:
             performable_of(row, **passed)
-        message = str(refused.value)
-        assert message.startswith(f"row {row.id} of StrangeAction has no value for {name!r}: {reason}")
-        assert message.endswith(f"; pass one, as in performable_of(row, {name}=…)")
-        passed[name] = [1.0] if name == "numbers" else 1.0
-    assert performable_of(row, **passed) == StrangeActionPerformable("odd", [1.0], 1.0, 1.0)
+        assert str(refused.value) == (
+            f"row {row.id} of StrangeAction has no value for {name!r}: {reason}; pass one, as in"
+            f" performable_of(row, {name}=…)"
+        )
+        passed[name] = 1.0
+    assert performable_of(row, **passed) == StrangeActionPerformable("odd", 1.0, 1.0)
 
 
 @pytest.mark.slow
@@ -337,8 +322,8 @@ def test_built_in_shapes_are_used_where_name_and_type_have_one() -> None:
         assert [each.original_pose for each in world.objects] == [AT, AT, Pose()]
 
 
-@pytest.mark.parametrize("name", ["unnamed & <bold>", "tiago"])
-def test_a_point_has_the_recorded_joints_links_and_attachments(name: str) -> None:
+def test_a_point_has_the_recorded_joints_links_and_attachments() -> None:
+    name = "unnamed & <bold>"
     moment = snapshot(
         recorded_snapshot(name, "ROBOT", joints={"elbow": 12.5, "torso": -0.3}),
         recorded_snapshot("milk", attached_to=(name, "hand")),
@@ -384,33 +369,22 @@ def test_a_users_description_replaces_the_built_in_shape(tmp_path: Path) -> None
             assert tuple(world.object("milk").bounding_box().size) == pytest.approx((0.01, 0.01, 0.01))
 
 
-@pytest.mark.parametrize(
-    ("moment", "error", "message"),
-    [
-        (
-            snapshot(recorded_snapshot("milk", joints={"lid": 1.0})),
-            UnknownJoint,
-            "'milk' has no movable joint 'lid'; its joints are: none",
-        ),
-        (
-            snapshot(recorded_snapshot("milk"), recorded_snapshot("bowl", "BOWL", attached_to=("milk", "lid"))),
-            UnknownLink,
-            "'milk' has no link 'lid'; its links are: milk",
-        ),
-    ],
-)
-def test_a_description_that_does_not_fit_the_recorded_state_is_refused(
-    moment: Moment, error: type[Exception], message: str
-) -> None:
-    world = world_of(moment, descriptions={"milk": NARROW})
-    with BulletWorld() as outer:
-        with pytest.raises(error) as refused, world:
-            pytest.fail("the world was entered")
-        assert str(refused.value) == message
-        assert current_world.get() is outer
-        assert not world.entered
-        with pytest.raises(WorldClosed):
-            _ = world.engine
+def test_a_description_that_does_not_fit_the_recorded_state_is_refused() -> None:
+    with_lid = recorded_snapshot("milk", joints={"lid": 1.0})
+    on_lid = recorded_snapshot("bowl", "BOWL", attached_to=("milk", "lid"))
+    for moment, error, message in (
+        (snapshot(with_lid), UnknownJoint, "'milk' has no movable joint 'lid'; its joints are: none"),
+        (snapshot(recorded_snapshot("milk"), on_lid), UnknownLink, "'milk' has no link 'lid'; its links are: milk"),
+    ):
+        world = world_of(moment, descriptions={"milk": NARROW})
+        with BulletWorld() as outer:
+            with pytest.raises(error) as refused, world:
+                pytest.fail("the world was entered")
+            assert str(refused.value) == message
+            assert current_world.get() is outer
+            assert not world.entered
+            with pytest.raises(WorldClosed):
+                _ = world.engine
 
 
 def test_an_impossible_snapshot_is_refused_in_one_line() -> None:

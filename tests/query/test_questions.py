@@ -60,13 +60,6 @@ def actions() -> list[Node]:
     return [each for each in NODES if each.started.kind == "action"]
 
 
-def test_the_random_memories_have_what_is_asked_for() -> None:
-    assert len(ROOT_FAILURES) > 40
-    assert {each.recovered for each in ROOT_FAILURES} == {True, False}
-    assert any(each.status == "RUNNING" for each in actions())
-    assert any(each.is_failed and any(child.is_failed for child in each.children) for each in NODES)
-
-
 # --- failures -------------------------------------------------------------------------------------------------
 
 
@@ -114,11 +107,8 @@ async def test_failures_are_found_by_their_columns(reading: Reading) -> None:
     assert await failures_found(reading, text="too far") == reckoned(
         lambda each: each.reason == "IKError" or each.message == "Too far"
     )
+    assert await failures_found(reading, text="run of") == []  # which is in the descriptions of the episodes
     assert await failures_found(reading, limit=3) == [(each.episode, each.sequence) for each in ROOT_FAILURES[:3]]
-
-
-async def test_no_failure_answers_to_the_description_of_its_episode(reading: Reading) -> None:
-    assert await failures_found(reading, text="run of") == []
 
 
 async def test_failures_are_counted_by_their_cause(reading: Reading) -> None:
@@ -349,31 +339,17 @@ async def test_the_sql_of_each_question_returns_its_rows(reading: Reading, fille
     assert of_identity[durations] != of_last[durations]
 
 
-@pytest.mark.parametrize("name", ["05", "005", "00", "-5", "aa"])
-async def test_a_text_that_is_neither_a_number_nor_begins_an_id_is_no_episode_of_a_statement_either(
-    reading: Reading, name: str
-) -> None:
-    question = reading.ask.durations(episode=name)
-    with pytest.raises(UnknownEpisode, match=f"there is no episode '{name}'"):
-        await question.rows()
-    for write in (lambda: question.statement, lambda: question.sql):
-        with pytest.raises(UnknownEpisode, match=f"there is no episode '{name}'; `pycrorm episodes` lists all"):
-            write()
-    for number in ("5", 5):
-        five = reading.ask.durations(episode=number)
+async def test_a_statement_names_an_episode_by_its_number_or_its_whole_id(reading: Reading) -> None:
+    for episode in ("5", 5, (await reading.episode("5")).id.upper()):
+        five = reading.ask.durations(episode=episode)
         assert await reading.rows(five.statement) == await five.rows() != []
-
-
-async def test_digits_with_which_several_ids_begin_name_no_episode_of_a_statement(reading: Reading) -> None:
-    identity = (await reading.episode("5")).id
-    for episode, rows in {
-        "0000": [],
-        "ffff": [],
-        identity: await reading.ask.durations(episode=5).rows(),
-    }.items():
-        assert await reading.rows(reading.ask.durations(episode=episode).statement) == rows, episode
-    with pytest.raises(UnknownEpisode, match="25 episodes have an id that begins with '0000': use more of its digits"):
-        await reading.ask.durations(episode="0000").rows()
+    for name, refusal in (("0000", "25 episodes have an id that begins with '0000'"), ("05", "no episode '05'")):
+        question = reading.ask.durations(episode=name)
+        with pytest.raises(UnknownEpisode, match=refusal):
+            await question.rows()
+        for attribute in ("statement", "sql"):
+            with pytest.raises(CallerError, match=f"by its number, its whole id or `last`, got '{name}'"):
+                getattr(question, attribute)
 
 
 async def test_a_question_is_awaited_for_a_frame_of_its_columns(reading: Reading) -> None:
@@ -394,81 +370,64 @@ async def test_a_question_to_an_empty_memory_has_no_rows(database_url: str) -> N
             assert (await question).empty
 
 
+WRONG: list[tuple[str, dict[str, Any], str]] = [
+    ("root_failures", {"objekt": "milk"}, r"root_failures has no argument objekt; did you mean object\?$"),
+    ("episodes", {"status": "SUCEEDED"}, "no status 'SUCEEDED'; did you mean SUCCEEDED"),
+    ("successful_pick_ups", {"arm": "lefft"}, "no arm 'lefft'; did you mean LEFT"),
+    ("successful_pick_ups", {"grasp": "tip"}, "no grasp 'tip'; did you mean TOP"),
+    ("root_failures", {"limit": 0}, "limit must be a whole number from 1"),
+    ("steps_before_failures", {"steps": 1_000}, "steps must be a whole number from 1 to 100, got 1000"),
+    ("experience_at", {"x": "left", "y": 0}, "x must be a number of metres, got 'left'"),
+    ("experience_at", {"x": 10**400, "y": 0}, "x must be a number of metres, got 1000"),
+    ("experience_at", {"x": 0, "y": 0, "radius_m": 0}, "radius_m must be > 0"),
+    *(
+        ("root_failures", {name: value}, f"{name} must be a text, got")
+        for name, value in (("arm", 3), ("object", b"milk"), ("text", ["a"]), ("reason", 1.5), ("message", True))
+    ),
+    ("episodes", {"tag": "a\0b"}, r"tag has U\+0000 or half of a surrogate pair"),
+    ("object_history", {"name": "\ud800"}, r"name has U\+0000"),
+    ("root_failures", {"text": "x " * 31}, "text has 31 words, and at most 30 are searched for"),
+    ("durations", {"dtype": int}, "dtype must be a text"),
+    ("root_failures", {"recovered": "yes"}, "recovered must be True or False, got 'yes'"),
+    ("episodes", {"since": "today"}, "since must be a datetime with a time zone, got 'today'"),
+    ("episodes", {"since": datetime(2026, 1, 1)}, "since has no time zone"),  # noqa: DTZ001
+    ("durations", {"kind": "actions"}, "kind must be"),
+]
+
+
 @pytest.mark.soak_on("postgresql")
 async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: Reading) -> None:
-    ask = reading.ask
+    for question, arguments, refusal in WRONG:
+        with pytest.raises(CallerError, match=refusal):
+            getattr(reading.ask, question)(**arguments)
     with pytest.raises(AttributeError, match=r"no question root_failure; did you mean root_failures"):
-        ask.root_failure  # type: ignore[attr-defined]  # noqa: B018
-    with pytest.raises(CallerError, match=r"root_failures has no argument objekt; did you mean object\?$"):
-        ask.root_failures(objekt="milk")  # type: ignore[call-arg]
-    with pytest.raises(CallerError, match="no status 'SUCEEDED'; did you mean SUCCEEDED"):
-        ask.episodes(status="SUCEEDED")
-    with pytest.raises(CallerError, match="no arm 'lefft'; did you mean LEFT"):
-        ask.successful_pick_ups(arm="lefft")
-    with pytest.raises(CallerError, match="no grasp 'tip'; did you mean TOP"):
-        ask.successful_pick_ups(grasp="tip")
-    with pytest.raises(CallerError, match="limit must be a whole number from 1"):
-        ask.root_failures(limit=0)
-    with pytest.raises(CallerError, match="steps must be a whole number from 1 to 100, got 1000"):
-        ask.steps_before_failures(steps=1_000)
-    with pytest.raises(CallerError, match="x must be a number of metres, got 'left'"):
-        ask.experience_at("left", 0)  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="x must be a number of metres, got 1000"):
-        ask.experience_at(10**400, 0)
-    for name, value in (("arm", 3), ("object", b"milk"), ("text", ["a"]), ("reason", 1.5), ("message", True)):
-        with pytest.raises(CallerError, match=f"{name} must be a text, got"):
-            ask.root_failures(**{name: value})  # type: ignore[arg-type]
-    for text in ("a\0b", "\ud800"):
-        with pytest.raises(CallerError, match=r"tag has U\+0000 or half of a surrogate pair"):
-            ask.episodes(tag=text)
-        with pytest.raises(CallerError, match=r"name has U\+0000"):
-            ask.object_history(text)
-    with pytest.raises(CallerError, match="text has 31 words, and at most 30 are searched for"):
-        ask.root_failures(text="x " * 31)
-    with pytest.raises(CallerError, match="dtype must be a text"):
-        ask.durations(dtype=int)  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="recovered must be True or False, got 'yes'"):
-        ask.root_failures(recovered="yes")  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="since must be a datetime with a time zone, got 'today'"):
-        ask.episodes(since="today")  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="radius_m must be > 0"):
-        ask.experience_at(0, 0, radius_m=0)
-    with pytest.raises(CallerError, match="kind must be"):
-        ask.durations(kind="actions")  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="since has no time zone"):
-        ask.episodes(since=datetime(2026, 1, 1))  # noqa: DTZ001
+        reading.ask.root_failure  # type: ignore[attr-defined]  # noqa: B018
     with pytest.raises(CallerError, match=r"got 1\.5"):
-        await ask.durations(episode=1.5).rows()  # type: ignore[arg-type]
+        await reading.ask.durations(episode=1.5).rows()  # type: ignore[arg-type]
     with pytest.raises(UnknownEpisode, match="there is no episode '99'"):
-        await ask.durations(episode=99)
+        await reading.ask.durations(episode=99)
 
 
-@pytest.mark.parametrize(
-    ("question", "arguments", "suggests"),
-    [
-        ("root_failures", {"arm": "lefft"}, "no arm lefft; did you mean LEFT"),
-        ("root_failures", {"object": "mlik"}, "no object mlik; did you mean milk"),
-        ("root_failures", {"reason": "unreachabel"}, "no reason unreachabel; did you mean unreachable"),
-        ("failures_by_cause", {"reason": "ColisionEror"}, "no reason ColisionEror; did you mean CollisionError"),
-        ("moves_of", {"name": "mlik"}, "no object mlik; did you mean milk"),
-        ("object_history", {"name": "mil"}, "no object mil; did you mean milk"),
-        ("durations", {"dtype": "PickUpActoin"}, "no type PickUpActoin; did you mean PickUpAction"),
-        ("successful_pick_ups", {"object": "mlik"}, "no object mlik; did you mean milk"),
-    ],
-)
+UNKNOWN: list[tuple[str, dict[str, str], str]] = [
+    ("root_failures", {"arm": "lefft"}, "no arm lefft; did you mean LEFT"),
+    ("root_failures", {"object": "mlik"}, "no object mlik; did you mean milk"),
+    ("root_failures", {"reason": "unreachabel"}, "no reason unreachabel; did you mean unreachable"),
+    ("failures_by_cause", {"reason": "ColisionEror"}, "no reason ColisionEror; did you mean CollisionError"),
+    ("object_history", {"name": "mil"}, "no object mil; did you mean milk"),
+    ("durations", {"dtype": "PickUpActoin"}, "no type PickUpActoin; did you mean PickUpAction"),
+]
+
+
 @pytest.mark.soak_on("postgresql")
-async def test_an_empty_answer_about_an_unknown_name_warns_with_the_nearest_one(
-    reading: Reading, question: str, arguments: dict[str, str], suggests: str
-) -> None:
-    with pytest.warns(UserWarning, match=rf"^no row answers: the memory has {suggests}"):
-        assert await getattr(reading.ask, question)(**arguments).rows() == []
-
-
-async def test_an_empty_answer_about_a_name_of_the_memory_or_an_unlike_one_warns_of_nothing(reading: Reading) -> None:
-    assert await reading.ask.root_failures(object="MILK", message="no such text").rows() == []
-    assert await reading.ask.root_failures(object="helicopter").rows() == []
+async def test_an_empty_answer_about_an_unknown_name_warns_with_the_nearest_one(reading: Reading) -> None:
+    for question, arguments, suggests in UNKNOWN:
+        with pytest.warns(UserWarning, match=rf"^no row answers: the memory has {suggests}"):
+            assert await getattr(reading.ask, question)(**arguments).rows() == []
     with pytest.warns(UserWarning, match="mlik"):
         assert (await reading.ask.moves_of("mlik")).empty
+    # A name that the memory has, or one unlike all others, is no mistake.
+    assert await reading.ask.root_failures(object="MILK", message="no such text").rows() == []
+    assert await reading.ask.root_failures(object="helicopter").rows() == []
 
 
 async def test_a_question_to_a_closed_memory_is_refused_and_opens_no_connection(tmp_path: Path) -> None:

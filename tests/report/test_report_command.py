@@ -38,29 +38,21 @@ from tests.full_disk import files_of_at_most
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_file_and_its_size(recorded: Path, tmp_path: Path) -> None:
-    done = pycrorm("report", "1", "--out", tmp_path / "a b.html", "--json", cwd=recorded)
-    answer = json.loads(done.stdout)
-    assert (answer["file"], answer["bytes"]) == (str(tmp_path / "a b.html"), (tmp_path / "a b.html").stat().st_size)
-    assert (answer["first"], answer["last"]) == (1, answer["events"])
-
-
-@pytest.mark.slow
-def test_without_a_name_the_file_is_named_after_the_episode(recorded: Path) -> None:
+def test_a_page_has_the_name_of_its_episode_or_the_given_one_and_replaces_a_file_only_when_asked(
+    recorded: Path, tmp_path: Path
+) -> None:
     done = pycrorm("report", "last", cwd=recorded)
     assert (done.returncode, done.stdout) == (0, "episode-3.html\n")
     assert (recorded / "episode-3.html").exists()
-
-
-@pytest.mark.slow
-def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path: Path) -> None:
-    file = tmp_path / "page.html"
+    file = tmp_path / "a b.html"
     file.write_text("mine")
     done = pycrorm("report", "1", "--out", file, cwd=recorded)
     assert done.returncode == 2
     assert one_line_of(done) == f"pycrorm: {file} exists: add --force to replace it, or give another name"
     assert file.read_text() == "mine"
-    assert pycrorm("report", "1", "--out", file, "--force", cwd=recorded).returncode == 0
+    answer = json.loads(pycrorm("report", "1", "--out", file, "--force", "--json", cwd=recorded).stdout)
+    assert (answer["file"], answer["bytes"]) == (str(file), file.stat().st_size)
+    assert (answer["first"], answer["last"]) == (1, answer["events"])
     assert file.read_text().startswith("<!doctype html>")
 
 
@@ -99,13 +91,7 @@ def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
 def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "my robots.html"
     done = pycrorm("report", "--all", "--out", out, "--json", cwd=recorded)
-    assert json.loads(done.stdout) == {
-        "file": str(out),
-        "episodes": 3,
-        "pages": 3,
-        "left_out": 0,
-        "unreadable": {},
-    }
+    assert json.loads(done.stdout) == {"file": str(out), "episodes": 3, "pages": 3, "left_out": 0, "unreadable": {}}
     names = [each.name for each in sorted((tmp_path / "my robots.pages").iterdir())]
     assert names == ["episode-1.html", "episode-2.html", "episode-3.html"]
     again = pycrorm("report", "--all", "--out", out, cwd=recorded)
@@ -184,23 +170,16 @@ async def test_a_disk_that_fills_leaves_no_page_and_no_folder_of_a_table_of_epis
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "last", "continues"), [(None, None, True), (3, None, True), (None, 4, False)])
-def test_a_full_page_names_the_next_window(
-    recorded: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    first: int | None,
-    last: int | None,
-    *,
-    continues: bool,
-) -> None:
+def test_a_full_page_names_the_next_window(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     notes: list[str] = []
     monkeypatch.setattr(document, "_NODES_MAX", 2)
     monkeypatch.setattr("pycrorm_async.cli.output.note", notes.append)
-    url = f"sqlite:///{recorded / 'pycrorm.db'}"
-    page = tmp_path / "page.html"
-    command.report(episode="1", chosen=Chosen(), out=page, first=first, last=last, place=ReadingPlace(url))
-    assert any("the next page: --from " in each for each in notes) == continues
+    place = ReadingPlace(f"sqlite:///{recorded / 'pycrorm.db'}")
+    for number, (first, last, continues) in enumerate(((None, None, True), (3, None, True), (None, 4, False))):
+        notes.clear()
+        page = tmp_path / f"page {number}.html"
+        command.report(episode="1", chosen=Chosen(), out=page, first=first, last=last, place=place)
+        assert any("the next page: --from " in each for each in notes) == continues
 
 
 # === output files =============================================================================================
@@ -236,37 +215,21 @@ def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_afterwards(
     assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
 
 
-@pytest.mark.parametrize("below", ["rows.csv", "folder/rows.csv"])
-@pytest.mark.parametrize("force", [False, True])
-def test_a_file_that_is_named_as_a_folder_is_called_a_file(tmp_path: Path, below: str, *, force: bool) -> None:
+def test_a_file_that_is_named_as_a_folder_is_called_a_file(tmp_path: Path) -> None:
     file = tmp_path / "notes.txt"
     file.write_bytes(b"notes")
-    with pytest.raises(CallerError) as refused:
-        write_file(b"rows", file / below, force=force)
-    assert str(refused.value) == (
-        f"{file} is a file, so {file / below} cannot be written below it: give the name of a folder"
-    )
+    for below in (file / "rows.csv", file / "folder/rows.csv"):
+        with pytest.raises(CallerError, match=f"{file} is a file, so {below} cannot be written below it: give the"):
+            write_file(b"rows", below, force=True)
     assert file.read_bytes() == b"notes"
 
 
-@pytest.mark.parametrize("exists", [False, True])
-def test_a_new_file_gets_its_name_on_a_file_system_without_links_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
-) -> None:
+def test_a_file_that_another_process_made_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     target = tmp_path / "rows.csv"
-
-    def link(*_: object, **__: object) -> None:
-        if exists:
-            target.write_bytes(b"of another process")
-        raise PermissionError(errno.EPERM, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", link)
-    if exists:
-        with pytest.raises(CallerError, match="exists: add --force"):
-            write_file(b"all of it", target)
-    else:
-        write_file(b"all of it", target)
-    assert target.read_bytes() == (b"of another process" if exists else b"all of it")
+    with pytest.raises(CallerError, match="exists: add --force"), new_file(target, force=False) as written:
+        written.write_bytes(b"all of it")
+        target.write_bytes(b"of another process")
+    assert target.read_bytes() == b"of another process"
     assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
 
 
