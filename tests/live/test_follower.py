@@ -53,6 +53,7 @@ def url_of(folder: Path) -> str:
     return put_memory(folder / "pycrorm.db")
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_listener_gets_each_part_once_and_the_list_what_runs(database_url: str, tmp_path: Path) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory, followed(database_url) as follower:
         drive = memory.recording.type("action", "DriveAction", {"target": Pose})

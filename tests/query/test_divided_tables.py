@@ -186,38 +186,9 @@ def of_episode(class_: Any, *options: Any) -> Callable[[Reading], Coroutine[Any,
     return lambda reading: rows_of(reading, select(class_).where(class_.process_metadata_id == ASKED).options(*options))
 
 
-async def a_frame_of_pick_ups(reading: Reading) -> None:
-    view = PickUpWithContextView
-    frame = await reading.dataframe(select(view, view.object_z).where(view.process_metadata_id == ASKED))
-    assert len(frame) == 1
-
-
-async def the_scenes_of_pick_ups(reading: Reading) -> None:
-    view = PickUpWithContextView
-    assert (
-        len(await reading.dataframe(select(view.scene, view.description).where(view.process_metadata_id == ASKED))) == 1
-    )
-
-
-async def the_policies_of_pick_ups(reading: Reading) -> None:
-    view = PickUpWithContextView
-    frame = await reading.dataframe(select(view.policy).where(view.process_metadata_id == ASKED))
-    assert list(frame.policy) == ["seen"]
-
-
-async def a_joined_question(reading: Reading) -> None:
-    question = select(PickUpAction).join(PickUpAction.object).join(Object.pose).join(PickUpAction.node)
-    await rows_of(reading, question.where(PickUpAction.process_metadata_id == ASKED, Object.name == "milk"))
-
-
 async def spatial_relations(reading: Reading) -> None:
     async with reading.session() as session:
         await session.scalars(select(SpatialRelation).where(SpatialRelation.process_metadata_id == ASKED))
-
-
-async def an_episode_with_robots(reading: Reading) -> None:
-    query = select(ProcessMetaData).where(ProcessMetaData.id == ASKED)
-    await rows_of(reading, query.options(selectinload(ProcessMetaData.robots)))
 
 
 async def the_tree(reading: Reading) -> None:
@@ -247,6 +218,10 @@ def selected(statement: Any, episode: Any) -> Callable[[Reading], Coroutine[Any,
     return read
 
 
+PICK_UPS = PickUpWithContextView
+PICK_UP_EPISODE = PICK_UPS.process_metadata_id
+JOINED = select(PickUpAction).join(PickUpAction.object).join(Object.pose).join(PickUpAction.node)
+ROBOTS = select(ProcessMetaData).options(selectinload(ProcessMetaData.robots))
 ROLLOUTS = rollouts_question(scene="kitchen", seed=69)
 ROUNDS = episodes_question(scene="kitchen", seeds=[69], policies=["seen"])
 ARGUMENTS = {"object_history": ("milk",), "moves_of": ("milk",), "experience_at": (0.5, 0.0)}
@@ -256,7 +231,7 @@ ARGUMENTS = {"object_history": ("milk",), "moves_of": ("milk",), "experience_at"
     "question",
     [
         *(pytest.param(asked(each, *ARGUMENTS.get(each, ())), id=each) for each in QUESTIONS),
-        pytest.param(selected(ROLLOUTS, PickUpWithContextView.process_metadata_id), id="rollouts"),
+        pytest.param(selected(ROLLOUTS, PICK_UP_EPISODE), id="rollouts"),
         pytest.param(selected(ROUNDS, ProcessMetaData.id), id="episodes of rollouts"),
         pytest.param(
             selected(policy_contents("learned"), Observation.process_metadata_id), id="the content of a policy"
@@ -268,13 +243,13 @@ ARGUMENTS = {"object_history": ("milk",), "moves_of": ("milk",), "experience_at"
         pytest.param(of_episode(Object, selectinload(Object.node)), id="objects with nodes"),
         pytest.param(of_episode(LocationResolution, selectinload(LocationResolution.refusals)), id="places"),
         pytest.param(of_episode(EpisodeRobot), id="robots"),
-        pytest.param(an_episode_with_robots, id="an episode with its robots"),
+        pytest.param(selected(ROBOTS, ProcessMetaData.id), id="an episode with its robots"),
         pytest.param(of_episode(PickUpWithContextView), id="pick-ups"),
-        pytest.param(a_frame_of_pick_ups, id="a data frame of pick-ups"),
+        pytest.param(selected(select(PICK_UPS.id, PICK_UPS.object_z), PICK_UP_EPISODE), id="places of pick-ups"),
         pytest.param(of_episode(RootFailure), id="where failures began"),
-        pytest.param(the_scenes_of_pick_ups, id="scenes of pick-ups"),
-        pytest.param(the_policies_of_pick_ups, id="policies of pick-ups"),
-        pytest.param(a_joined_question, id="a join"),
+        pytest.param(selected(select(PICK_UPS.scene, PICK_UPS.description), PICK_UP_EPISODE), id="scenes of pick-ups"),
+        pytest.param(selected(select(PICK_UPS.policy), PICK_UP_EPISODE), id="policies of pick-ups"),
+        pytest.param(selected(JOINED.where(Object.name == "milk"), PickUpAction.process_metadata_id), id="a join"),
         pytest.param(spatial_relations, id="spatial relations"),
         pytest.param(the_tree, id="the task tree"),
         pytest.param(a_snapshot, id="a snapshot"),

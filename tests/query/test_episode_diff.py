@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from functools import partial
 
 import pytest
@@ -80,12 +79,6 @@ def filled_url(module_database_url: str) -> str:
     records = [*TYPES, *(record for each in scripts for record in each.records)]
     run_in_own_loop(append_and_fold(module_database_url, records))
     return module_database_url
-
-
-@pytest.fixture
-async def reading(filled_url: str) -> AsyncIterator[Reading]:
-    async with Reading.open(filled_url) as opened:
-        yield opened
 
 
 async def test_its_sql_reads_the_rows_that_it_compares(reading: Reading, filled_url: str) -> None:

@@ -43,7 +43,7 @@ from tests.projections.event_script import (
     pose,
     row,
 )
-from tests.projections.sql_queries import ask
+from tests.projections.sql_queries import ask, stored_and_folded
 
 GO = declared("GoAction", "go_action", field("place", "pose", 2), field("arm", "enum", 3))
 PLACE = {"position": [1.0, 2.0, 0.0], "orientation": [0.0, 0.0, 0.0, 1.0], "frame": "map", "time_ns": T0_NS - 1_000_007}
@@ -67,11 +67,8 @@ def _script() -> Script:
     return script
 
 
-async def test_views_have_the_parameters_with_the_pose_and_the_tables_have_one_row_of_it(log: EventLog) -> None:
-    projector = Projector(log)
-    await projector.open()
-    await log.append([*declarations(GO, NAVIGATE, MOVE), *_script().records])
-    await projector.catch_up()
+async def test_views_and_moments_have_parameters_with_the_pose_and_the_tables_one_row_of_it(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(GO, NAVIGATE, MOVE), *_script().records])
     rows = await ask(log, "SELECT id, parameters FROM designator ORDER BY id")
     assert [(key, json.loads(text)) for key, text in rows] == [
         (row(3), {"place": PLACE, "arm": "LEFT"}),
@@ -85,6 +82,10 @@ async def test_views_have_the_parameters_with_the_pose_and_the_tables_have_one_r
     assert await ask(log, "SELECT target_location_id FROM navigate_action") == [(row(3, 2),)]
     poses = await ask(log, "SELECT id, x, y FROM pose WHERE x > 0 ORDER BY id")
     assert poses == [(row(3, 2), 1.0, 2.0), (row(7, 2), 0.5, 0.0)]
+    async with Reading.open_address(log.address) as reading:
+        then = await reading.as_of(1, sequence=6)
+    with_pose = [{"place": PLACE, "arm": "LEFT"}, {"target_location": PLACE}, {"target": PLACE}]
+    assert [node.parameters for node in then.tree] == [{}, *with_pose]
 
 
 async def test_views_survive_what_only_looks_like_a_name_of_a_pose(log: EventLog) -> None:
@@ -96,10 +97,7 @@ async def test_views_survive_what_only_looks_like_a_name_of_a_pose(log: EventLog
     given += [{"texts": {"pose_of": "2", "field": "x"}, 'a"b': {"missing": "why", "repr": "c"}}]
     for parameters in given:
         script.put(NodeStarted("action", root, name_of(label), parameters))
-    projector = Projector(log)
-    await projector.open()
-    await log.append([*declarations(label), *script.records])
-    await projector.catch_up()
+    await stored_and_folded(log, [*declarations(label), *script.records])
     for view in ("designator", "action"):
         rows = await ask(log, f"SELECT parameters FROM {view} ORDER BY id")
         assert [json.loads(text) for (text,) in rows] == given
@@ -107,31 +105,13 @@ async def test_views_survive_what_only_looks_like_a_name_of_a_pose(log: EventLog
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 async def test_a_damaged_event_hides_its_pose_and_not_the_nodes_that_name_it(log: EventLog) -> None:
-    projector = Projector(log)
-    await projector.open()
-    await log.append([*declarations(GO, NAVIGATE, MOVE), *_script().records])
-    await projector.catch_up()
+    await stored_and_folded(log, [*declarations(GO, NAVIGATE, MOVE), *_script().records])
     async with log.engine.begin() as connection:
         await connection.execute(sa.text("DROP TRIGGER event_is_not_updated"))
         await connection.execute(sa.text("UPDATE event SET payload = replace(payload, ':', ';') WHERE sequence = 3"))
     rows = await ask(log, "SELECT id, parameters FROM designator ORDER BY id LIMIT 3")
     reference = {"pose_of": 3, "field": "place", "slot": 2}
     assert [json.loads(text) for _, text in rows] == [{}, {"target_location": reference}, {"target": reference}]
-
-
-async def test_a_moment_of_the_episode_has_the_pose(log: EventLog) -> None:
-    projector = Projector(log)
-    await projector.open()
-    await log.append([*declarations(GO, NAVIGATE, MOVE), *_script().records])
-    await projector.catch_up()
-    async with Reading.open_address(log.address) as reading:
-        then = await reading.as_of(1, sequence=6)
-    assert [node.parameters for node in then.tree] == [
-        {},
-        {"place": PLACE, "arm": "LEFT"},
-        {"target_location": PLACE},
-        {"target": PLACE},
-    ]
 
 
 def test_cases_and_the_live_page_have_the_pose() -> None:
@@ -173,9 +153,8 @@ def _failing() -> Script:
     return script
 
 
-@pytest.mark.parametrize("batch_events", [1, 100])
-async def test_views_and_moments_and_pages_have_the_failure_at_each_node(log: EventLog, batch_events: int) -> None:
-    projector = Projector(log, projections=[Ends()], batch_events=batch_events)
+async def test_views_and_moments_and_pages_have_the_failure_at_each_node(log: EventLog) -> None:
+    projector = Projector(log, projections=[Ends()], batch_events=1)  # `verify` folds all in one batch
     await projector.open()
     await log.append([*declarations(GO, NAVIGATE, MOVE), *_failing().records])
     await projector.catch_up()

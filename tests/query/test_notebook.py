@@ -139,14 +139,7 @@ def test_each_value_that_a_memory_returns_has_a_view_once_a_memory_can_be_read()
     assert {EpisodeSummary, Moment, WorldThen, EpisodeDiff, SqlResult} < set(classes)
     text_only = value_html.dispatch(object)
     assert [each.__name__ for each in classes if value_html.dispatch(each) is text_only] == []
-
-
-def test_a_value_without_a_view_is_drawn_as_its_escaped_text() -> None:
-    class Unregistered(NotebookValue):
-        def __repr__(self) -> str:
-            return "<unregistered>"
-
-    assert Unregistered()._repr_html_() == "<pre>&lt;unregistered&gt;</pre>"
+    assert value_html(["<unregistered>"]) == "<pre>[&#x27;&lt;unregistered&gt;&#x27;]</pre>"
 
 
 def test_a_large_tree_shows_five_hundred_nodes_with_the_failures_among_them_and_counts_the_others() -> None:
@@ -178,6 +171,10 @@ def test_a_chart_has_events_or_time_as_its_axis() -> None:
     assert events.text.count("▶") == 2  # in its name and in its hint
     with pytest.raises(CallerError, match="axis must be 'events' or 'time', got 'days'"):
         tree.gantt("days")  # type: ignore[arg-type]
+    labels = re.findall(r">(e\d+)<", TaskTree([node(1, end_sequence=3)]).gantt().svg)
+    assert labels == ["e1", "e2", "e3"]  # none twice
+    concurrent = TaskTree([node(1, end_sequence=9), node(2, 1, end_sequence=7), node(3, 1, end_sequence=8)])
+    assert len({each["y"] for tag, each in Page(concurrent.gantt().svg).elements if tag == "rect"}) == 3
 
 
 @pytest.mark.parametrize(("failing", "line"), [(100, "all 26 failed nodes and 474 of 4,975"), (5, "of 501 failed")])
@@ -194,22 +191,8 @@ def test_a_chart_of_many_nodes_has_some_from_the_whole_episode_and_counts_them(f
         assert within.count("SUCCEEDED") >= 15
         assert 1 <= within.count("FAILED") <= 35
     assert "chosen at random" not in TaskTree(steps[:500]).gantt().svg
-
-
-def test_a_chart_of_a_deep_tree_is_drawn() -> None:
-    chart = Page(TaskTree([node(number, number - 1 or None) for number in range(1, 3_001)]).gantt().svg)
-    assert 1 <= chart.count("g") <= 500
-
-
-def test_a_chart_of_few_events_repeats_no_label() -> None:
-    labels = re.findall(r">(e\d+)<", TaskTree([node(1, end_sequence=3)]).gantt().svg)
-    assert labels == ["e1", "e2", "e3"]
-
-
-def test_concurrent_nodes_have_lanes_of_their_own() -> None:
-    tree = TaskTree([node(1, end_sequence=9), node(2, 1, end_sequence=7), node(3, 1, end_sequence=8)])
-    lanes = [each["y"] for tag, each in Page(tree.gantt().svg).elements if tag == "rect"]
-    assert len(set(lanes)) == 3
+    deep = Page(TaskTree([node(number, number - 1 or None) for number in range(1, 3_001)]).gantt().svg)
+    assert 1 <= deep.count("g") <= 500
 
 
 def test_lists_of_episodes_and_nodes_are_lists_whose_parts_are_drawn_too() -> None:

@@ -113,14 +113,11 @@ def test_points_of_an_array_and_of_pcd_files_are_the_same_and_are_placed_by_a_po
 @pytest.mark.parametrize(
     "data",
     [
-        pcd("binary_compressed", b"x"),
         pcd("ascii", b"1 2\n"),
         pcd("binary", b""),
-        b"POINTS 3",
         b"\nDATA ascii\n",
         pcd("ascii", b"").replace(b"POINTS 4", b"POINTS 99999999999"),
         pcd("binary", b"").replace(b"SIZE 4 4 4 4", b"SIZE 4 4 4 9"),
-        pcd("ascii", b"").replace(b"FIELDS rgb x y z", b"FIELDS a b c d"),
     ],
 )
 def test_a_file_that_is_no_cloud_has_a_reason_and_no_traceback(data: bytes) -> None:
@@ -154,13 +151,10 @@ def headed(header: bytes) -> bytes:
     "data",
     [
         b"",
-        b"GIF",
         npy(np.zeros(9))[:90],
         npy(np.array(["text"])),
-        b"\x93NUMPY\x01\x00",
         b"PK\x03\x04 no archive",
         headed(b"{'descr': ("),
-        headed(b"{1: 2, 'a': 3}"),
         headed(b"{'descr': '<f4', 'fortran_order': False, 'shape': (%d, 3), }" % 10**30),
     ],
 )

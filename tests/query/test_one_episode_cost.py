@@ -44,8 +44,7 @@ def few_and_many(request: pytest.FixtureRequest, many: int, tmp_path: Path) -> I
 
 @pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
-    "many",
-    [pytest.param(1_500, marks=pytest.mark.slow), pytest.param(5_000, marks=pytest.mark.soak)],
+    "many", [pytest.param(1_500, marks=pytest.mark.slow), pytest.param(5_000, marks=pytest.mark.soak)]
 )
 async def test_a_question_about_one_episode_costs_the_same_however_many_episodes_there_are(
     few_and_many: dict[int, str], tmp_path: Path

@@ -104,20 +104,6 @@ CASES: dict[str, tuple[list[Any], EpisodeStatus | None, list[str]]] = {
 }  # fmt: skip
 
 
-def test_each_way_in_which_a_plan_goes_on_has_its_outcome(database_url: str, tmp_path: Path) -> None:
-    with Memory.sync(database_url, spool=tmp_path / "spool") as memory:
-        plan = Plan(memory)
-        for tree, status, _ in CASES.values():
-            plan.record(tree, status)
-        memory.flush()
-        rows = memory.ask.root_failures().rows()
-        for number, (name, (_, _, outcomes)) in enumerate(CASES.items(), 1):
-            found = [(each.outcome, each.recovered) for each in rows if each.episode == number]
-            assert (name, found) == (name, [(each, each == "recovered") for each in outcomes])
-        recovered = [outcome for _, _, outcomes in CASES.values() for outcome in outcomes].count("recovered")
-        assert len(memory.ask.root_failures(recovered=True).rows()) == recovered
-
-
 def test_a_failure_is_open_while_nothing_around_it_has_ended(database_url: str, tmp_path: Path) -> None:
     with Memory.sync(database_url, spool=tmp_path / "spool") as memory:
         plan = Plan(memory)
@@ -133,7 +119,7 @@ def test_a_failure_is_open_while_nothing_around_it_has_ended(database_url: str, 
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_questions_pages_agents_and_recall_give_the_same_outcomes_and_rates(
+async def test_questions_pages_agents_and_recall_give_each_failure_its_outcome_and_the_same_rates(
     database_url: str, tmp_path: Path
 ) -> None:
     with Memory.sync(database_url, spool=tmp_path / "spool") as memory:
@@ -142,7 +128,12 @@ async def test_questions_pages_agents_and_recall_give_the_same_outcomes_and_rate
             plan.record(tree, status)
         memory.flush()
     async with Reading.open(database_url) as reading:
+        rows = await reading.ask.root_failures().rows()
+        for number, (name, (_, _, outcomes)) in enumerate(CASES.items(), 1):
+            found = [(each.outcome, each.recovered) for each in rows if each.episode == number]
+            assert (name, found) == (name, [(each, each == "recovered") for each in outcomes])
         expected = Counter(outcome for _, _, outcomes in CASES.values() for outcome in outcomes)
+        assert len(await reading.ask.root_failures(recovered=True).rows()) == expected["recovered"]
         causes = await reading.ask.failures_by_cause().rows()
         counted = {name: sum(getattr(each, name) for each in causes) for name in expected}
         assert counted == expected

@@ -132,18 +132,13 @@ async def test_a_mesh_is_drawn_where_its_file_is_recorded_and_as_its_box_elsewhe
     ("episode", "options", "message"),
     [
         ("2", {}, "episode 2 has no objects to draw: no world was recorded"),
-        (
-            "1",
-            {"at": "e1"},
-            "episode 1 was empty at event 1, so nothing is drawn; its first object was added at event",
-        ),
+        ("1", {"at": "e1"}, "episode 1 was empty at event 1, so nothing is drawn; its first object was added at event"),
         ("3", {"at": "e3"}, "episode 3 has no shapes to draw: of turtle, its description was not recorded"),
         ("1", {"focus": "milk"}, "had no object 'milk' at this moment; its objects: courier, cube, far away"),
         ("1", {"at": "noon"}, "at takes seconds since the episode's start, or an event such as e300, got 'noon'"),
         ("1", {"width": 3}, "at least 16 x 16 and at most 4,000,000 pixels, not 3 x 480"),
         ("1", {"pitch_deg": 90.0}, "pitch_deg must be -89 to 89, got 90"),
         ("1", {"yaw_deg": float("nan")}, "yaw_deg must be a finite number, got nan"),
-        ("1", {"yaw_deg": float("inf")}, "yaw_deg must be a finite number, got inf"),
     ],
 )
 async def test_what_cannot_be_drawn_is_one_line(
@@ -209,20 +204,14 @@ def test_a_collada_file_whose_y_axis_is_up_is_turned() -> None:
     [
         ("a.ply", b"", "not a readable ply file"),
         ("a.3ds", b"", "the format '3ds' is not read"),
-        ("mesh", b"", "the format 'mesh' is not read"),
         ("a.stl", b"", "it has no triangles"),
         ("a.stl", mesh_files.binary_stl()[:-1], "vertex|no triangles"),
         ("a.stl", b"solid x\nvertex a b c", "not a readable stl file"),
-        ("a.stl", b"solid x\nvertex 1 1 1\nvertex 1 1 1", "not a readable stl|reshape"),
         ("a.stl", b" " * 80 + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), "not finite"),
-        ("a.obj", b"v 1 2\nf 1 1 1", "not a readable obj file"),
         ("a.obj", b"v 1 2 3\nf 1 2 3", "not a readable obj file"),
         ("a.obj", b"v 1 2 3\n", "it has no triangles"),
-        ("a.obj", b"\xff\xfe", "not a readable obj file"),
         ("a.dae", b"<COLLADA", "not a readable dae file"),
-        ("a.dae", b"<COLLADA/>", "not a readable dae file"),
         ("a.dae", mesh_files.collada().replace(b'url="#g"', b'url="#other"'), "not a readable dae file"),
-        ("a.dae", mesh_files.collada().replace(b"VERTEX", b"OTHER"), "not a readable dae file"),
     ],
 )
 def test_a_file_without_triangles_has_a_reason(name: str, content: bytes, reason: str) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm.base import Base, UtcTime
 from pycrorm_async.orm.documentation import described
 from pycrorm_async.orm.documentation import schema as declared_schema
@@ -24,16 +24,10 @@ README = Path(__file__).parents[2] / "pycrorm_async/query/README.md"
 
 
 @pytest.fixture(scope="module")
-def url(module_database_url: str) -> str:
+def filled_url(module_database_url: str) -> str:
     records = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records]
     run_in_own_loop(append_and_fold(module_database_url, records))
     return module_database_url
-
-
-@pytest.fixture
-async def reading(url: str) -> AsyncIterator[Reading]:
-    async with Reading.open(url) as opened:
-        yield opened
 
 
 def test_every_column_of_a_time_has_its_unit_and_every_built_in_view_a_sentence() -> None:
@@ -67,7 +61,8 @@ async def test_a_view_that_does_not_exist_is_answered_with_the_nearest(reading: 
 
 @pytest.mark.slow
 @pytest.mark.soak_on("postgresql")
-def test_the_command_prints_text_json_and_a_diagram(url: str, tmp_path: Path) -> None:
+def test_the_command_prints_text_json_and_a_diagram(filled_url: str, tmp_path: Path) -> None:
+    url = filled_url
     done = pycrorm("schema", "pose", "--json", "--url", url, cwd=tmp_path)
     [pose] = json.loads(done.stdout)
     assert (pose["mapped"], pose["columns"][0]["name"]) == ("Pose", "id")
@@ -93,9 +88,7 @@ def commented(url: str) -> dict[tuple[str, str], str]:
     return {(view, column): text for view, column, text in rows}
 
 
-def test_postgresql_keeps_the_texts_as_comments_also_after_new_types_and_a_rebuild(
-    server: Server, tmp_path: Path
-) -> None:
+def test_postgresql_keeps_the_texts_as_comments_also_after_new_types_and_a_rebuild(server: Server) -> None:
     url = server.new_database()
     run_in_own_loop(append_and_fold(url, [*declarations(NAVIGATE, PICK_UP), *episode(1).records[:3]]))
     first = commented(url)
@@ -104,5 +97,5 @@ def test_postgresql_keeps_the_texts_as_comments_also_after_new_types_and_a_rebui
     assert len(first) > 400
     run_in_own_loop(append_and_fold(url, [*declarations(SAYING), *episode(2).records]))
     assert commented(url) == first
-    assert pycrorm("rebuild", "--url", url, cwd=tmp_path).returncode == 0
+    run_in_own_loop(rebuild_memory(url, workers=1))
     assert commented(url) == first

@@ -127,26 +127,23 @@ async def rows_by_view(log: EventLog) -> dict[str, list[Any]]:
     }
 
 
-async def test_every_view_shows_the_same_rows_whether_or_not_simulations_were_recorded(log: EventLog) -> None:
+async def test_every_view_shows_simulations_only_to_a_session_that_asks_for_them(log: EventLog) -> None:
+    """To such a session it shows as many rows again as the real episode has."""
     await store_and_fold(log, everything(1))
     before = await rows_by_view(log)
     leaves = {each.table for each in TYPES}
     own = set(COLUMNS) - {"simulated_episode"} | {"designator", "action", "motion", "language", "robot_state"}
     own |= {"position", "quaternion", "designator_type", "PickUpWithContextView", "reached", *leaves}
     assert [name for name in own if not before[name]] == []
-    await store_and_fold(log, everything(2, THOUGHT), everything(3, NodeReference(episode_text(Script(2).episode), 2)))
+    await store_and_fold(log, everything(2, THOUGHT))
     assert await rows_by_view(log) == before
-
-
-async def test_a_session_that_asks_for_simulations_sees_them_in_every_view(log: EventLog) -> None:
-    """As many rows again as the real episode has, in each of the views."""
-    await store_and_fold(log, everything(1), everything(2, THOUGHT))
-    once = {name: len(rows) for name, rows in (await rows_by_view(log)).items()}
     async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
         connection = await session.connection()
-        for name, count in once.items():
-            answer = await connection.exec_driver_sql(f'SELECT count(*) FROM "{name}"')
-            assert (name, answer.scalar_one()) == (name, count if name in OF_NO_EPISODE else 2 * count)
+        for name, rows in before.items():
+            count = (await connection.exec_driver_sql(f'SELECT count(*) FROM "{name}"')).scalar_one()
+            assert (name, count) == (name, len(rows) if name in OF_NO_EPISODE else 2 * len(rows))
+        with pytest.raises(DBAPIError):
+            await connection.exec_driver_sql("UPDATE zz_pose__1001 SET x = 5")
 
 
 async def test_the_same_queries_return_simulations_on_request(log: EventLog) -> None:
@@ -225,16 +222,7 @@ async def test_later_simulations_are_visible_too(log: EventLog) -> None:
             assert (await session.scalars(select(wave))).all() == []
 
 
-async def test_a_session_with_simulations_cannot_write(log: EventLog) -> None:
-    await store_and_fold(log, everything(1))
-    before = await names(log, "table", "view")
-    async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
-        with pytest.raises(DBAPIError):
-            await (await session.connection()).exec_driver_sql("UPDATE zz_pose__1001 SET x = 5")
-    assert await names(log, "table", "view") == before
-
-
-async def test_the_overview_leaves_simulations_out_unless_asked(log: EventLog) -> None:
+async def test_the_overview_leaves_simulations_out_unless_asked_and_one_is_found_by_its_name(log: EventLog) -> None:
     deeper = NodeReference(episode_text(Script(2).episode), 2)
     elsewhere = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
     await store_and_fold(log, everything(1), everything(2, THOUGHT), everything(3, deeper), everything(4, elsewhere))
@@ -243,6 +231,9 @@ async def test_the_overview_leaves_simulations_out_unless_asked(log: EventLog) -
             (1, False, None)
         ]
         all_of_them = await reading.episodes(simulated=True)
+        assert (await reading.episode("2")).simulated
+        assert (await reading.episode(episode_text(Script(2).episode))).number == 2
+        assert (await reading.episode("last")).number == 1
     assert [(each.number, each.simulated, each.thought_by) for each in all_of_them] == [
         (1, False, None),
         (2, True, SimulatingNode(episode_text(REAL), 1, row(THINKING), "NavigateAction")),
@@ -250,16 +241,6 @@ async def test_the_overview_leaves_simulations_out_unless_asked(log: EventLog) -
         (4, True, SimulatingNode(elsewhere.episode, None, None, None)),
     ]
     assert {(each.nodes, each.failed) for each in all_of_them} == {(6, 1)}
-
-
-async def test_a_simulated_episode_is_found_by_name_and_the_last_episode_is_a_real_one(log: EventLog) -> None:
-    await store_and_fold(log, everything(1), everything(2, THOUGHT))
-    async with Reading.open_address(log.address) as reading:
-        assert (await reading.episode("2")).simulated
-        assert (await reading.episode(episode_text(Script(2).episode))).number == 2
-        assert (await reading.episode("last")).number == 1
-        with pytest.raises(UnknownEpisode, match="lists the only one"):
-            await reading.episode("3")
 
 
 async def test_a_tree_names_the_simulations_of_its_nodes_and_a_simulations_own_tree_is_printed(log: EventLog) -> None:

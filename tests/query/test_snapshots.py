@@ -149,18 +149,10 @@ ID = "00000000-0000-7000-8000-000000000001"
 
 
 @pytest.fixture(scope="module")
-def recorded(module_database_url: str) -> DatabaseAddress:
-    """A log in which episode 1 is the story."""
-    address = DatabaseAddress.parse(module_database_url)
-
+def filled_url(module_database_url: str) -> str:
+    """The URL of a memory in which episode 1 is the story."""
     run_in_own_loop(append_and_fold(module_database_url, [*declarations(*TYPES), *story().records]))
-    return address
-
-
-@pytest.fixture
-async def reading(recorded: DatabaseAddress) -> AsyncIterator[Reading]:
-    async with Reading.open_address(recorded) as opened:
-        yield opened
+    return module_database_url
 
 
 def state_of(then: Moment) -> tuple[str, str, str]:

@@ -33,7 +33,7 @@ def kept(cases: list[Case]) -> list[Case]:
     return sorted(ordered, key=lambda case: case.type)
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(CASES)
 def test_a_block_returns_its_cases_from_its_bytes(cases: list[Case]) -> None:
     block = decode(encode(CaseBlock.of(cases)))
@@ -41,7 +41,7 @@ def test_a_block_returns_its_cases_from_its_bytes(cases: list[Case]) -> None:
     assert len(block) == len(cases)
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(CASES, st.randoms())
 def test_the_same_cases_make_the_same_bytes_in_any_order_and_in_any_parts(
     cases: list[Case], chance: random.Random
@@ -54,7 +54,7 @@ def test_the_same_cases_make_the_same_bytes_in_any_order_and_in_any_parts(
     assert encode(merge(blocks)) == data
 
 
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(CASES, CASES, st.randoms())
 def test_blocks_are_the_same_where_their_cases_are_whatever_else_they_had(
     cases: list[Case], others: list[Case], chance: random.Random
@@ -165,7 +165,7 @@ class Memory:
 
 
 async def test_every_case_is_at_hand_once_whatever_happens_to_the_blocks() -> None:
-    for seed in range(20):
+    for seed in range(8):
         chance = random.Random(seed)
         memory = Memory()
         reader = CaseReader(memory, memory)

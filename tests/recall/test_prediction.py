@@ -241,6 +241,7 @@ def levels_of(tree: Any) -> list[float]:
     return [each.designator.level for each in tree if isinstance(each.designator, GripSlidingActionPerformable)]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_advised_plan_tries_the_likeliest_alternatives_and_refuses_the_others(
     database_url: str, tmp_path: Path
 ) -> None:
@@ -349,6 +350,14 @@ async def test_parallel_plans_are_all_advised_and_one_that_outlives_the_advice_e
             assert levels_of(tree) == [0.5, 0.5, 0.5]
 
 
+async def test_what_is_no_action_and_a_minimum_that_is_no_chance_are_refused() -> None:
+    async with Memory.open("sqlite://") as memory:
+        with pytest.raises(CallerError, match="3 is no action: give one"):
+            await memory.predict(3)  # type: ignore[arg-type]
+        with pytest.raises(CallerError, match="minimum must be a chance from 0 to 1, got 30"), memory.advising(30):
+            pass
+
+
 async def test_alternatives_before_the_failure_of_a_description_are_tried() -> None:
     class Failing(GripSliding):
         def __iter__(self) -> Iterator[GripSlidingActionPerformable]:
@@ -362,20 +371,6 @@ async def test_alternatives_before_the_failure_of_a_description_are_tried() -> N
             with pytest.raises(PlanFailure, match="there is no further way"):
                 await Retry(Failing([1.5]), max_tries=2).perform()
         assert levels_of(tree) == [0.5]
-
-
-async def test_what_is_no_action_is_not_predicted() -> None:
-    async with Memory.open("sqlite://") as memory:
-        with pytest.raises(CallerError, match="3 is no action: give one"):
-            await memory.predict(3)  # type: ignore[arg-type]
-
-
-def test_a_minimum_is_a_chance() -> None:
-    with (
-        pytest.raises(CallerError, match="minimum must be a chance from 0 to 1, got 30"),
-        Memory.open("sqlite://").advising(30),
-    ):
-        pass
 
 
 @pytest.mark.slow

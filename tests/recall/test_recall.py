@@ -30,6 +30,9 @@ from tests.recall.sliding_grips import (
     record,
 )
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""Blocks are read and searched alike there: `test_both_databases_and_a_rebuild_return_the_same_answers`."""
+
 
 @pytest.fixture(scope="module")
 def url(module_database_url: str, tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -82,6 +85,9 @@ async def test_conditions_hold_for_every_action_of_the_answer(recall: Recall) ->
     inside = await recall(GRIP, during=fetch)
     assert [round(each.numbers["level"], 1) for each in inside] == [0.9, 0.7]
     assert len(await recall(GRIP, during=("2020-01-01", "2200-01-01"))) == 12
+    answer = await recall(GRIP, only={"arm": "MIDDLE"})
+    assert (list(answer), answer.never_seen) == ([], (("arm", "MIDDLE"),))
+    assert list(await recall("FlyAction", has={"wing": "LEFT"})) == []
 
 
 BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
@@ -92,15 +98,11 @@ BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "negative node": ({"before": -1}, CallerError, "there is no case of -1"),
     "tag": ({"tag": "kitchn"}, CallerError, "no episode has the tag 'kitchn'; did you mean kitchen?"),
     "robot": ({"robot": "pr2"}, CallerError, "has a feature 'robot'"),
-    "order": ({"before": "2026-01-01", "after": "2026-01-02"}, CallerError, "`before` is not later than `after`"),
-    "k": ({"k": 0}, CallerError, "k must be 1 to 10,000"),
     "a text as k": ({"k": "3"}, CallerError, "k must be 1 to 10,000, got '3'"),
-    "half a case": ({"k": 2.5}, CallerError, "k must be 1 to 10,000, got 2.5"),
     "a text as score": ({"minimum": "a"}, CallerError, "minimum must be a score from 0 to 1, got 'a'"),
     "None": ({"has": {"arm": None}}, CallerError, "arm is given as None: leave it out"),
     "a list of features": ({"has": ["arm"]}, CallerError, "features are given as ['arm']: give a dictionary"),
     "a long feature": ({"has": {"x" * 1_000_000: "y"}}, CallerError, "... (1,000,002 characters)"),
-    "three moments": ({"during": ("2026-01-01",) * 3}, CallerError, "`during` takes a case, or two moments, got 3"),
     "a name as case": ({"prohibit": ["1/20"]}, CallerError, "'1/20' is not a case: give one of an answer"),
     "one prohibited": ({"prohibit": 5}, CallerError, "`prohibit` takes a list of cases"),
 }
@@ -125,15 +127,6 @@ async def test_other_wrong_arguments_are_refused_in_one_line(recall: Recall) -> 
         await recall.like("1/20")  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="activation must be a number, got 'often'"):
         await recall.forget("often")  # type: ignore[arg-type]
-
-
-async def test_a_condition_that_no_case_ever_fulfilled_is_reported(recall: Recall) -> None:
-    answer = await recall(GRIP, only={"arm": "MIDDLE"})
-    assert (list(answer), answer.never_seen) == ([], (("arm", "MIDDLE"),))
-
-
-async def test_a_type_that_never_occurred_has_an_empty_answer(recall: Recall) -> None:
-    assert list(await recall("FlyAction", has={"wing": "LEFT"})) == []
 
 
 async def test_from_a_case_one_gets_to_what_was_around_it(recall: Recall) -> None:

@@ -1,9 +1,12 @@
 """Fixtures of the report's tests: memories with episodes to show, and their pages."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.report.write import Report, report
 from tests.commands import pycrorm
 from tests.shared_folders import made_once
 
@@ -49,6 +52,12 @@ async def drives():
 
 
 FUNCTIONS = ("plan", "dies", "drives")
+
+
+async def page_of(url: str, path: Path, **options: Any) -> Report:
+    """Write the page of the first episode of a memory."""
+    async with Reading.open(url) as reading:
+        return await report(reading, 1, path, **options)
 
 
 def _record(folder: Path) -> None:

@@ -12,9 +12,9 @@ from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.pictures import Images
-from pycrorm_async.report.write import report
 from pycrorm_async.world import Pose
 from tests.report.browser import Browser
+from tests.report.conftest import page_of
 
 HOSTILE = '"><img src=x onerror=alert(1)>'
 
@@ -96,11 +96,10 @@ async def test_ten_thousand_images_make_a_page_of_200_and_of_every_camera_its_sh
 async def test_a_page_with_200_thumbnails_has_less_than_8_megabytes(url: str, tmp_path: Path) -> None:
     pytest.importorskip("PIL")
     observe(url, 200, 320)
-    async with Reading.open(url) as reading:
-        written = await report(reading, "last", tmp_path / "page.html")
-        assert written.path.stat().st_size < 8_000_000
-        full = await report(reading, "last", tmp_path / "full.html", images="full")
-        assert written.path.stat().st_size < full.path.stat().st_size < 40_000_000
+    written = await page_of(url, tmp_path / "page.html")
+    assert written.path.stat().st_size < 8_000_000
+    full = await page_of(url, tmp_path / "full.html", images="full")
+    assert written.path.stat().st_size < full.path.stat().st_size < 40_000_000
 
 
 SHOWN = "[...document.querySelectorAll('#seen figcaption')].map((each) => each.textContent)"
@@ -111,8 +110,7 @@ async def test_the_page_shows_the_picture_of_the_moment_on_the_axis_beside_the_s
     url: str, tmp_path: Path, chrome: Browser
 ) -> None:
     observe(url, 12)
-    async with Reading.open(url) as reading:
-        await report(reading, "last", tmp_path / "page.html")
+    await page_of(url, tmp_path / "page.html")
     with chrome.open(tmp_path / "page.html") as tab:
         tab.settle()
         assert f"{HOSTILE} rgb" in tab.ask(SHOWN)
@@ -142,8 +140,7 @@ async def test_the_page_shows_the_picture_of_the_moment_on_the_axis_beside_the_s
 @pytest.mark.slow
 async def test_without_a_world_the_pictures_are_shown_alone(url: str, tmp_path: Path, chrome: Browser) -> None:
     observe(url, 3, world=False)
-    async with Reading.open(url) as reading:
-        await report(reading, "last", tmp_path / "page.html", images="full")
+    await page_of(url, tmp_path / "page.html", images="full")
     with chrome.open(tmp_path / "page.html", width=390) as tab:
         tab.settle()
         assert tab.ask("document.querySelector('#seen img').getBoundingClientRect().height") > 60
