@@ -44,22 +44,6 @@ def document(folder: Path) -> Any:
     return json.loads((folder / "document.json").read_text())
 
 
-@pytest.mark.soak  # learning/test_experiment resumes one
-def test_recorded_rollouts_are_not_repeated(document: Any, folder: Path) -> None:
-    refused = pycrorm(*SMALL, cwd=folder)
-    line = one_line_of(refused)
-    assert "400 rollouts of this experiment are recorded already" in line
-    assert "--resume" in line
-    assert refused.returncode == 2
-    done = pycrorm(*BY_ONE, "--resume", "--figure", "two.svg", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("from the log") > 2
-    assert f"{document['phases'][1]['success_rate']:.1%}" in done.stdout
-    assert "picked up" in done.stdout
-    assert "two.svg" in done.stderr
-    assert (folder / "two.svg").read_text().startswith("<?xml")
-
-
 def test_the_memory_lists_its_policies_and_writes_their_files(document: Any, folder: Path, tmp_path: Path) -> None:
     name, phases = document["policy"]["name"], document["phases"]
     listed = {each["name"]: each for each in answer("policies", cwd=folder)}

@@ -252,7 +252,6 @@ def test_the_command_prints_its_version(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
-        pytest.param("pycrorm reb", "rebuild", marks=pytest.mark.soak),
         ("pycrorm run --wr", "--writer"),
         ("pycrorm spool rep", "repair"),
     ],
@@ -337,9 +336,9 @@ async def test_a_second_rebuild_is_refused_with_one_line(database_url: str, tmp_
     assert one_line_of(done).endswith("a `pycrorm rebuild` or `pycrorm archive` is running: wait for it to end")
 
 
-def start_rebuild(folder: Path, workers: str) -> subprocess.Popen[str]:
-    """Start a rebuild in a process group of its own."""
-    command = [*COMMAND, "rebuild", "--workers", workers]
+def start_rebuild(folder: Path) -> subprocess.Popen[str]:
+    """Start a rebuild with workers in a process group of its own."""
+    command = [*COMMAND, "rebuild", "--workers", "2"]
     pipe = subprocess.PIPE
     return subprocess.Popen(
         command, cwd=folder, env=environment(), stdout=pipe, stderr=pipe, text=True, start_new_session=True
@@ -355,16 +354,14 @@ def lock(blocker: sqlite3.Connection) -> None:
         time.sleep(0.0005)
 
 
-@pytest.mark.soak_on("1")
-@pytest.mark.parametrize("workers", ["1", "2"])
-def test_an_interrupted_rebuild_exits_with_130_and_the_next_one_continues(tmp_path: Path, workers: str) -> None:
+def test_an_interrupted_rebuild_exits_with_130_and_the_next_one_continues(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
     asyncio.run(append_and_fold(url, [*TYPES, *(each for number in range(1, 50) for each in picking(number).records)]))
     before = tables_of(url)
     blocker = sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=0)
     making = "SELECT generation FROM pycrorm_generation WHERE projection = 'tables/making'"
     for _ in range(20):  # a rebuild may end before the lock is taken
-        process = start_rebuild(tmp_path, workers)
+        process = start_rebuild(tmp_path)
         while not blocker.execute(making).fetchall() and process.poll() is None:
             time.sleep(0.001)
         lock(blocker)

@@ -413,8 +413,6 @@ async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "code", "reason"),
     [
-        (["7"], 2, "there is no episode '7' (`pycrorm episodes` lists all 2)"),
-        (["0000"], 2, "2 episodes have an id that begins with '0000': use more of its digits"),
         (["9" * 5000], 2, "there is no episode"),
         (["1", "--type", "nodestarted"], 2, "unknown event type 'nodestarted'; known types: DescriptionDeclared, "),
     ],

@@ -50,6 +50,8 @@ DISK_BYTES = 40_000
 """More than SQLite's own files need."""
 ONE, OTHER = aliased(TaskTreeNode), aliased(TaskTreeNode)
 NOISE = type_coerce(func.random(), Integer())
+ON_SQLITE = pytest.mark.parametrize("module_database_url", ["sqlite"], indirect=True)
+"""The database makes no difference to what a test shows."""
 LARGE = select(ONE.dtype, *(NOISE.label(f"noise{n}") for n in range(4))).join(OTHER, true())
 
 
@@ -156,7 +158,7 @@ async def test_a_question_with_a_wrong_argument_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.soak_on("postgresql")
+@ON_SQLITE
 async def test_every_question_is_exported_with_declared_types_of_episodes_that_have_ended(
     either: Reading, tmp_path: Path
 ) -> None:
@@ -238,7 +240,7 @@ async def test_a_cancelled_export_closes_its_file_after_the_last_write(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.soak_on("postgresql")
+@ON_SQLITE
 async def test_parts_of_killed_exports_are_deleted_and_those_of_running_ones_kept(
     either: Reading, tmp_path: Path
 ) -> None:
@@ -274,6 +276,7 @@ async def test_a_file_is_replaced_only_when_asked(reading: Reading, tmp_path: Pa
     assert file.read_text().startswith('"id"')
 
 
+@ON_SQLITE
 async def test_a_running_episode_is_refused_by_name_and_left_out_of_a_view(either: Reading, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="episode 1 is still running, so its rows change"):
         await export(either, "1", tmp_path / "a.csv")
@@ -311,7 +314,7 @@ async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Pat
         ("2", (), "\udcff.csv", CallerError, r"\\udcff.csv. is not UTF-8: give another name"),
     ],
 )
-@pytest.mark.soak_on("postgresql")
+@ON_SQLITE
 async def test_mistakes_are_named_and_leave_no_file(
     either: Reading,
     tmp_path: Path,
@@ -326,7 +329,7 @@ async def test_mistakes_are_named_and_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.soak_on("postgresql")
+@ON_SQLITE
 async def test_without_pyarrow_the_error_names_the_extra(
     either: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -482,6 +485,7 @@ async def test_the_manifest_makes_the_same_bytes_again(reading: Reading, tmp_pat
     assert (await export_again(reading, tmp_path / "own.csv.manifest.json", statement=own)).same
 
 
+@ON_SQLITE
 async def test_what_differs_from_the_manifest_is_named(either: Reading, tmp_path: Path) -> None:
     await export(either, "2", tmp_path / "nodes.csv")
     file = tmp_path / "nodes.csv.manifest.json"

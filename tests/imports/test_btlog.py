@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 from contextlib import closing
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import one_line_of, pycrorm
+from pycrorm_async.errors import CallerError
+from pycrorm_async.imports.registry import import_files
 from tests.databases import ask
 from tests.imports.importing import imported, tree
 
@@ -123,23 +125,28 @@ BOMB = '<!DOCTYPE r [<!ENTITY a "aaaa">]><root>&a;</root>'
 
 
 @pytest.mark.parametrize(
-    ("content", "line", "code"),
+    ("content", "line"),
     [
-        (b"BTCPP4-FileLogger2\2" + bytes(40), "has the protocol 2, and this version reads 1", 2),
-        (btlog([])[:40], "ends before its first transition", 4),
-        (b"SQLite format 3\0" + bytes(100), "is no log of BehaviorTree.CPP 4", 2),
-        (b"", "is no log of BehaviorTree.CPP 4, which begins with BTCPP4-FileLogger2", 2),
-        (btlog([], "<root>"), "has a tree that is no XML", 2),
-        (btlog([], BOMB), "has a tree with a document type", 2),
-        (btlog([], "<root><BehaviorTree><A/></BehaviorTree></root>"), "has a tree without ids of its nodes", 2),
-        (btlog([], XML.replace('"7"', '"6"')), "has a tree with two nodes of the id 6", 2),
+        (b"BTCPP4-FileLogger2\2" + bytes(40), "has the protocol 2, and this version reads 1"),
+        (b"SQLite format 3\0" + bytes(100), "is no log of BehaviorTree.CPP 4"),
+        (b"", "is no log of BehaviorTree.CPP 4, which begins with BTCPP4-FileLogger2"),
+        (btlog([], "<root>"), "has a tree that is no XML"),
+        (btlog([], BOMB), "has a tree with a document type"),
+        (btlog([], "<root><BehaviorTree><A/></BehaviorTree></root>"), "has a tree without ids of its nodes"),
+        (btlog([], XML.replace('"7"', '"6"')), "has a tree with two nodes of the id 6"),
     ],
 )
-def test_a_wrong_or_cut_log_is_one_line(tmp_path: Path, content: bytes, line: str, code: int) -> None:
+def test_a_wrong_log_is_one_line(tmp_path: Path, content: bytes, line: str) -> None:
     (tmp_path / "run.btlog").write_bytes(content)
-    done = pycrorm("import", "btlog", "run.btlog", "--dry-run", cwd=tmp_path)
-    assert done.returncode == code
-    assert line in one_line_of(done)
+    with pytest.raises(CallerError, match=re.escape(line)) as refused:
+        import_files("btlog", [tmp_path / "run.btlog"], None)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_log_cut_in_its_header_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "run.btlog").write_bytes(btlog([])[:40])
+    report = import_files("btlog", [tmp_path / "run.btlog"], None)
+    assert (report.episodes, ["ends before its first transition" in each for each in report.cut]) == ([], [True])
 
 
 def test_rows_of_other_values_and_times_out_of_range_end_no_import(tmp_path: Path) -> None:

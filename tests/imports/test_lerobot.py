@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ import pytest
 from pyarrow import parquet
 
 from pycrorm_async import Memory
+from pycrorm_async.errors import CallerError
+from pycrorm_async.imports.registry import import_files
 from pycrorm_async.world.pose import Pose
-from tests.commands import one_line_of, pycrorm
+from tests.commands import pycrorm
 from tests.databases import ask
 from tests.imports.importing import imported, tree
 
@@ -170,6 +173,6 @@ def test_a_wrong_data_set_is_one_line(tmp_path: Path, change: Any, line: str) ->
         file.unlink()
     else:
         file.write_text(json.dumps(change(info)))
-    done = pycrorm("import", "lerobot", "set", "--dry-run", cwd=tmp_path)
-    assert done.returncode == 2, done.stderr
-    assert line in one_line_of(done)
+    with pytest.raises(CallerError, match=re.escape(line)) as refused:
+        import_files("lerobot", [folder], None)
+    assert "\n" not in str(refused.value)
