@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, TypeAlias
 
 import typer
@@ -276,8 +276,6 @@ def _joints_text(each: ObjectThen, *, full: bool) -> str:
 #
 # Draw a recorded task tree with types, statuses, durations and failures.
 
-_DRAWN_MAX = 1_000
-"""Bounds the nodes that are drawn with colours and wrapped lines: each takes 0.5 ms, a plain line a tenth of that."""
 _MESSAGE_MAX = 100
 """Bounds the characters of a failure's message, so that a failed node takes few lines."""
 _SIMULATIONS_MAX = 10
@@ -291,41 +289,17 @@ _STYLES = {
 
 
 def print_tree(nodes: Sequence[named_queries.NodeSummary], *, events: bool = False, full: bool = False) -> None:
-    """Print the nodes of one episode as a tree; `nodes` lists each parent before its children.
+    """Print the nodes of one episode as a tree, one line each; `nodes` lists each parent before its children.
 
     With `events` each line has the events of the node's start and end. Long texts are cut and end in an ellipsis,
-    unless `full` is True. Many nodes are printed as plain lines.
+    unless `full` is True.
     """
-    if len(nodes) > _DRAWN_MAX:
-        lines = plain_lines(nodes, events=events, full=full, ascii_only=output.stdout.options.ascii_only)
-        sys.stdout.writelines(f"{line}\n" for line in lines)
-        output.note(
-            f"{len(nodes):,} nodes, more than {_DRAWN_MAX:,}: no colours, no line breaks (`pycrorm report` draws them)"
-        )
-        return
-    root = tree_of(nodes, events=events, full=full)
-    if root is not None:
-        output.stdout.print(root)
-
-
-def tree_of(
-    nodes: Iterable[named_queries.NodeSummary], *, events: bool = False, full: bool = False, no_wrap: bool = False
-) -> Tree | None:
-    """Return the tree that `print_tree` prints; None if there are no nodes. With `no_wrap` each node takes one line."""
-    drawn: dict[int, Tree] = {}
-    root: Tree | None = None
-    nodes = list(nodes)
-    robots = _acting_robots(nodes)
-    for node in nodes:
-        line = _line(node, robots.get(node.id), events=events, full=full)
-        if no_wrap:
-            line.no_wrap, line.overflow = True, "ellipsis"
-        parent = drawn.get(node.parent_id) if node.parent_id is not None else None
-        if parent is not None:
-            drawn[node.id] = parent.add(line)
-        else:
-            drawn[node.id] = root = Tree(line)
-    return root
+    is_colored = output.stdout.is_terminal
+    for line in tree_lines(nodes, events=events, full=full):
+        if is_colored:
+            output.stdout.print(line, soft_wrap=True)
+        else:  # a tenth of the time
+            sys.stdout.write(f"{line.plain}\n")
 
 
 def _acting_robots(nodes: Sequence[named_queries.NodeSummary]) -> dict[int, str]:
@@ -334,10 +308,6 @@ def _acting_robots(nodes: Sequence[named_queries.NodeSummary]) -> dict[int, str]
     if len({each for each in robots.values() if each}) < 2:
         return {}
     return {node.id: node.robot for node in nodes if node.robot and node.robot != robots.get(node.parent_id or 0)}
-
-
-def _line(node: named_queries.NodeSummary, robot: str | None, *, events: bool, full: bool) -> Text:
-    return Text.assemble(*_parts(node, robot, events=events, full=full))
 
 
 def _parts(
@@ -368,11 +338,11 @@ def _parts(
         yield f"  simulated in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", "magenta"
 
 
-def plain_lines(
-    nodes: Sequence[named_queries.NodeSummary], *, events: bool = False, full: bool = False, ascii_only: bool = False
-) -> Iterator[str]:
-    """Yield a line for each node of a tree, without colours and however long."""
-    blank, continued, fork, end = Tree.ASCII_GUIDES if ascii_only else Tree.TREE_GUIDES[0]
+def tree_lines(
+    nodes: Sequence[named_queries.NodeSummary], *, events: bool = False, full: bool = False
+) -> Iterator[Text]:
+    """Yield a line for each node of a tree, however long."""
+    blank, continued, fork, end = Tree.ASCII_GUIDES if output.stdout.options.ascii_only else Tree.TREE_GUIDES[0]
     has_later_sibling: list[bool] = []
     followed: list[bool] = []
     """Whether each node has a later sibling, the last node first."""
@@ -386,7 +356,7 @@ def plain_lines(
     for node, is_followed in zip(nodes, reversed(followed), strict=True):
         del bars[max(node.depth - 1, 0) :]
         before = "".join(bars) + (fork if is_followed else end) if node.depth else ""
-        yield before + "".join(text for text, _ in _parts(node, robots.get(node.id), events=events, full=full))
+        yield Text.assemble(before, *_parts(node, robots.get(node.id), events=events, full=full))
         if node.depth:
             bars.append(continued if is_followed else blank)
 

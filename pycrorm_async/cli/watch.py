@@ -23,7 +23,7 @@ from rich.text import Text
 
 from pycrorm_async.cli.output import JsonOption, note, print_json, print_line, stdout
 from pycrorm_async.cli.reading import ReadingPlace
-from pycrorm_async.cli.show import tree_of
+from pycrorm_async.cli.show import tree_lines
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.live.access import kept_token
 from pycrorm_async.live.follower import LogFollower, wait_unless
@@ -228,7 +228,10 @@ def _picture(moment: Moment, lines_max: int) -> RenderableType:
     hidden = len(moment.tree) - len(shown)
     if hidden:
         facts.append(f"{hidden} nodes that have ended are not drawn")
-    return Group(head, Text(visible("  " + " · ".join(facts)), style="dim"), tree_of(shown, no_wrap=True) or Text(""))
+    lines = [head, Text(visible("  " + " · ".join(facts)), style="dim"), *tree_lines(shown)]
+    for line in lines[2:]:
+        line.no_wrap, line.overflow = True, "ellipsis"
+    return Group(*lines)
 
 
 def in_sight(nodes: Sequence[NodeThen], lines_max: int) -> list[NodeThen]:

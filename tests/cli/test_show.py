@@ -1,27 +1,18 @@
 """`pycrorm show` and `pycrorm events`: an episode's task tree, its world at any moment, and its log."""
 
 import asyncio
-import io
 import json
-import random
 import signal
 import subprocess
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
-from typer.testing import CliRunner
 
-from pycrorm_async.cli import show as show_module
 from pycrorm_async.cli.episodes import episodes
-from pycrorm_async.cli.main import app
 from pycrorm_async.cli.output import Chosen, Form, stdout
 from pycrorm_async.cli.reading import ReadingPlace
-from pycrorm_async.cli.show import plain_lines, tree_of
 from pycrorm_async.events.codec import Record
-from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
@@ -185,41 +176,6 @@ def test_nodes_are_shown_with_the_events_of_their_start_and_end(ridden: Path) ->
     assert document["episode"]["end_sequence"] == episode["end_sequence"] == 23
     shown = pycrorm("show", "1", "--events", "--at", "e9", cwd=ridden).stdout
     assert [line.split()[-1] for line in shown.splitlines() if line.endswith("-")] == ["e2-", "e6-", "e7-"]
-
-
-def test_plain_lines_are_those_that_rich_draws() -> None:
-    rng = random.Random(3)
-    nodes: list[NodeSummary] = []
-
-    def grow(parent: int | None, depth: int) -> None:
-        number = len(nodes) + 1
-        reason = "GraspFault" if number % 3 == 0 else None
-        facts: Any = (f"A{number}Action", "action", {"arm": "LEFT"}, "FAILED" if reason else "SUCCEEDED")
-        times: Any = (datetime(2026, 1, 1, tzinfo=UTC), 10**6, reason, "[slipped]", False, number, None, (4, 5))
-        nodes.append(NodeSummary(number, parent, depth, *facts, *times))
-        for _ in range(rng.randrange(4) if depth < 6 else 0):
-            grow(number, depth + 1)
-
-    while len(nodes) < 40:
-        nodes.clear()
-        grow(None, 0)
-    for events, full, ascii_only in ((False, False, False), (True, True, True)):
-        encoding = "ascii" if ascii_only else "utf-8"
-        drawn = Console(file=io.TextIOWrapper(io.BytesIO(), encoding=encoding), width=400, color_system=None)
-        with drawn.capture() as captured:
-            drawn.print(tree_of(nodes, events=events, full=full))
-        lines = [each.rstrip() for each in captured.get().splitlines()]
-        assert [*plain_lines(nodes, events=events, full=full, ascii_only=ascii_only)] == lines
-
-
-def test_many_nodes_are_printed_as_plain_lines_with_a_note(ridden: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = pycrorm("show", "1", cwd=ridden)
-    monkeypatch.setattr(show_module, "_DRAWN_MAX", 3)
-    shown = CliRunner().invoke(app("show"), ["show", "1", "--url", f"sqlite:///{ridden}/pycrorm.db"])
-    assert shown.exit_code == 0, shown.output
-    tree = [each.rstrip() for each in drawn.stdout.splitlines()][-6:]
-    assert [each.rstrip() for each in shown.stdout.splitlines()][-6:] == tree
-    assert "6 nodes, more than 3: no colours" in shown.stderr
 
 
 def test_the_running_nodes_of_a_killed_robot_are_shown(tmp_path: Path) -> None:
