@@ -3,11 +3,9 @@
 import json
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -139,14 +137,6 @@ def test_a_plan_with_an_unrecordable_value_runs_to_its_end_with_a_warning(
     ]
 
 
-def test_a_plan_with_nan_in_a_pose_fails_with_a_memory_as_it_does_without(folder: Path) -> None:
-    done = pycrorm("run", "plans.py:nan_in_a_pose", cwd=folder)
-    assert "the plan plans.py:nan_in_a_pose failed: PoseRefused: 'pr2' cannot be moved to Pose" in done.stderr
-    assert "NavigateAction.target_location is recorded as missing" in done.stderr
-    assert (done.returncode, "Traceback" in done.stderr) == (1, False)
-    assert answer("show", "last", cwd=folder)["episode"]["status"] == "ERROR"
-
-
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
     folder: Path, signal_number: signal.Signals
@@ -224,10 +214,9 @@ def test_an_answer_that_cannot_be_written_is_reported_in_one_line(folder: Path) 
 # Hold the text of plans that fail, exit, never suspend, or pass values that cannot be recorded.
 
 PLANS = '''
-import asyncio, math, os, sys
+import asyncio, os, sys
 from dataclasses import dataclass
-from pycrorm_async.plan import ActionAbstract, NavigateActionPerformable, PlanFailure, simulated_robot
-from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.plan import ActionAbstract, NavigateActionPerformable, PlanFailure
 
 @dataclass
 class NoteActionPerformable(ActionAbstract):
@@ -258,12 +247,6 @@ async def cancels():
     await NoteActionPerformable("a").perform()
     asyncio.current_task().cancel()
     await asyncio.sleep(1)
-
-async def nan_in_a_pose():
-    await NoteActionPerformable("a").perform()
-    with BulletWorld(), simulated_robot:
-        Object("pr2", ObjectType.ROBOT)
-        await NavigateActionPerformable(Pose([math.nan, 0, 0])).perform()
 
 async def unrecordable():
     await NoteActionPerformable("a").perform()
@@ -329,19 +312,6 @@ def folder(tmp_path: Path) -> Path:
 # === bad database =============================================================================================
 #
 # A database that is none, is newer, belongs to another program or may only be read is refused in one line.
-
-
-def test_a_database_of_another_program_is_left_unchanged(folder: Path) -> None:
-    other = folder / "other.db"
-    with closing(sqlite3.connect(other)) as connection, connection:
-        connection.execute("CREATE TABLE recipe (name TEXT)")
-    connection.close()
-    before = other.read_bytes()
-    for arguments in (["run", "plans.py"], ["episodes"], ["writer", "--once"]):
-        done = pycrorm(*arguments, "--url", "sqlite:///other.db", cwd=folder)
-        assert "other.db" in one_line_of(done)
-        assert done.returncode == 3
-    assert other.read_bytes() == before
 
 
 def test_a_file_that_is_no_database_is_left_unchanged(folder: Path) -> None:

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import asyncpg
 import pytest
 
-from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import Server
 from tests.hand_written import fill, hand_written
 from tests.operations.memories import assert_same
@@ -66,13 +66,6 @@ def test_a_copy_reports_what_it_did_and_the_copy_of_the_copy_is_the_same(folder:
     rows = [line.split("│")[1:-1] for line in done.stdout.splitlines() if ids(0)[:20] in line]
     assert [[cell.strip() for cell in row] for row in rows] == [[f"{n}", ids(n), "0", "12", "12"] for n in (1, 2)]
     assert_same(f"sqlite:///{folder}/a.db", f"sqlite:///{folder}/b.db")
-
-
-def test_the_environment_may_name_the_source(folder: Path) -> None:
-    copying = Started("copy", "--to", "sqlite:///b.db", cwd=folder, PYCRORM_URL="sqlite:///a.db")
-    _, errors = copying.communicate()
-    assert (copying.returncode, errors) == (0, "")
-    assert logs_of(f"sqlite:///{folder}/b.db") == logs_of(f"sqlite:///{folder}/a.db")
 
 
 @pytest.mark.parametrize(

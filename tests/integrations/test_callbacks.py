@@ -150,35 +150,6 @@ def test_the_input_of_a_tool_is_its_parameters(tmp_path: Path) -> None:
     assert json.loads(result[0])["content"] == "picked milk"
 
 
-def test_a_number_with_and_without_a_decimal_point_is_in_one_column(tmp_path: Path) -> None:
-    def run(runs: RememberedRuns) -> None:
-        for force in (5, 5.5):
-            pick_up.invoke({"object_name": "milk", "force_n": force}, {"callbacks": [runs]})
-        pick_up.invoke({"object_name": "milk"}, {"callbacks": [runs]})
-
-    assert remembered(tmp_path, run).missing.total == 0
-    assert ask(tmp_path / "memory.db", "SELECT force_n FROM pick_up ORDER BY id") == [(5.0,), (5.5,), (None,)]
-
-
-def test_an_argument_without_a_value_adds_no_column_and_is_not_missing(tmp_path: Path) -> None:
-    @tool
-    def push(force: float | None) -> str:
-        """Push."""
-        return "pushed"
-
-    def run(runs: RememberedRuns) -> None:
-        for force in (3.5, None):
-            push.invoke({"force": force}, {"callbacks": [runs]})
-
-    assert remembered(tmp_path, run).missing.total == 0
-    assert "force_text" not in _columns(tmp_path, "push")
-    assert ask(tmp_path / "memory.db", "SELECT force FROM push ORDER BY id") == [(3.5,), (None,)]
-
-
-def _columns(folder: Path, table: str) -> set[str]:
-    return {name for _, name, *_ in ask(folder / "memory.db", f"PRAGMA table_info({table})")}
-
-
 def test_an_error_that_a_tool_answers_with_is_the_error_of_the_tool_only(tmp_path: Path) -> None:
     answers = [AIMessage("", tool_calls=[call("pick_up", "1", object_name="cup")]), AIMessage("sorry")]
     remembered(tmp_path, lambda runs: agent(*answers).invoke(request("cup"), {"callbacks": [runs]}))
@@ -270,28 +241,6 @@ def test_branches_in_threads_hang_below_their_own_chain(tmp_path: Path) -> None:
     below = "SELECT chain.name, object_name FROM pick_up JOIN task_tree_node AS node ON node.id = pick_up.id"
     rows = ask(tmp_path / "memory.db", f"{below} JOIN chain ON chain.id = node.parent_id")
     assert sorted(rows) == sorted((f"branch {number}", str(number)) for number in range(8) for _ in range(5))
-
-
-def test_a_run_whose_parent_reports_elsewhere_is_below_the_root(tmp_path: Path) -> None:
-    def run(runs: RememberedRuns) -> None:
-        inner = RunnableLambda(lambda each: each, name="inner").with_config(callbacks=[runs])
-        RunnableLambda(inner.invoke, name="outer").invoke("go")
-
-    status = remembered(tmp_path, run)
-    assert nodes(tmp_path) == [("Chain", None, "SUCCEEDED", None)]
-    assert status.faults.total == 0
-
-
-def test_values_that_cannot_be_recorded_reach_no_run(tmp_path: Path) -> None:
-    endless: list[Any] = []
-    endless.append(endless)
-
-    def run(runs: RememberedRuns) -> None:
-        assert RunnableLambda(lambda _each: endless).invoke(object(), {"callbacks": [runs]}) is endless
-        assert RunnableLambda(lambda _each: float("nan")).invoke("\ud800", {"callbacks": [runs]}) != 0
-
-    remembered(tmp_path, run)
-    assert [each[2] for each in nodes(tmp_path)] == ["SUCCEEDED", "SUCCEEDED"]
 
 
 def test_a_handler_used_after_its_block_and_after_its_memory_disturbs_no_run(tmp_path: Path) -> None:

@@ -136,16 +136,6 @@ def test_composites_and_decorators_are_language_and_other_behaviours_are_actions
     ]
 
 
-def test_behaviours_that_share_a_name_are_kept_apart(tmp_path: Path) -> None:
-    root = sequence("same", Scripted("same", named("RS")), Scripted("same", named("RF")), memory=True)
-    remembered(tmp_path, root, lambda ticked: tick(ticked, 3))
-    assert [(name, status, ticks) for name, _above, status, ticks, _message in nodes(tmp_path)] == [
-        ("same", "FAILED", 3),
-        ("same", "SUCCEEDED", 2),
-        ("same", "FAILED", 2),
-    ]
-
-
 class Reach(Scripted):
     """A behaviour with parameters, one of which cannot be read."""
 
@@ -304,27 +294,6 @@ def test_an_exception_in_a_behaviour_reaches_the_program_and_ends_its_branch_as_
         ("grasp", "arm", "ERROR", "no power"),
     ]
     assert_verified(tmp_path)
-
-
-def test_a_program_that_catches_the_exception_of_a_behaviour_ticks_on(tmp_path: Path) -> None:
-    arm = sequence("arm", Scripted("look", named("S")), Broken("grasp", OSError("no power")))
-
-    def run(ticked: Any) -> None:
-        for _ in range(2):
-            with pytest.raises(OSError, match="no power"):
-                ticked.tick()
-        arm.replace_child(arm.children[1], Scripted("grasp again", named("S")))
-        ticked.tick()
-
-    status = remembered(tmp_path, arm, run)
-    assert [each[:3] for each in nodes(tmp_path)] == [
-        ("arm", None, "INTERRUPTED"),
-        ("look", "arm", "SUCCEEDED"),
-        ("arm", None, "SUCCEEDED"),
-        ("look", "arm", "SUCCEEDED"),
-        ("grasp again", "arm", "SUCCEEDED"),
-    ]
-    assert status.faults.total == 0
 
 
 def test_ctrl_c_in_a_behaviour_is_recorded_and_reaches_the_program(tmp_path: Path) -> None:

@@ -9,9 +9,17 @@ from collections.abc import Callable, Iterable
 from pycrorm_async import Memory
 from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.types import EpisodeEnded
-from pycrorm_async.plan import NavigateAction, ParkArmsAction, SimulatedTaskTree
+from pycrorm_async.plan import (
+    MoveTorsoAction,
+    NavigateAction,
+    ObjectDesignatorDescription,
+    ParkArmsAction,
+    PickUpAction,
+    PlaceAction,
+    SimulatedTaskTree,
+)
 from pycrorm_async.settings import Settings
-from pycrorm_async.world import Arms, Pose
+from pycrorm_async.world import Arms, Grasp, Pose
 from tests.databases import ask
 from tests.hand_written import fill, hand_written
 from tests.memory.note_actions import NoteActionPerformable
@@ -20,7 +28,6 @@ from tests.projections.event_script import Script, append_and_fold
 from tests.promises.test_random_plans import play
 from tests.store.factories import declaration
 from tests.table_comparison import declarations_of, differences, logs_of, tables_of, united
-from tests.upstream.conftest import common_plan
 
 New = Callable[[], str]
 PATIENT = Settings(connect_timeout_s=120)
@@ -44,6 +51,15 @@ async def everything(url: str) -> None:
             await common_plan()
             scene.cereal.remove()
     await fill(url, [hand_written(3), lost(4)])
+
+
+async def common_plan() -> None:
+    """Drive, lift the torso, pick the milk up and put it back: 4 actions and 10 motions."""
+    milk = ObjectDesignatorDescription(names=["milk"])
+    await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
+    await MoveTorsoAction([0.3]).resolve().perform()
+    await PickUpAction(milk, [Arms.LEFT], [Grasp.FRONT]).resolve().perform()
+    await PlaceAction(milk, [Pose([1.3, 1, 0.9])], [Arms.LEFT]).resolve().perform()
 
 
 def lost(number: int) -> Script:

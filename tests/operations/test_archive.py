@@ -31,11 +31,10 @@ from pycrorm_async.store.stored import EpisodeRow
 from tests.commands import pycrorm
 from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import ask, put_memory
-from tests.operations.memories import everything, notes
+from tests.operations.memories import common_plan, everything, notes
 from tests.operations.test_removal import SECRET, assert_clean, erased, places_with, recorded
 from tests.plan.conftest import kitchen
 from tests.table_comparison import differences, logs_of, tables_of
-from tests.upstream.conftest import common_plan
 
 pytest.importorskip("duckdb_extension_ducklake", reason="the extra [lake] is not installed")
 pytestmark = pytest.mark.slow

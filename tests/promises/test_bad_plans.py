@@ -151,32 +151,6 @@ async def test_a_plan_without_world_or_robot_fails_with_the_next_step_and_is_rec
 #
 # An expression that was built wrongly, or of impossible parts, is recorded as failed, and the plan around it continues.
 
-well: Any = NoteActionPerformable("well")
-nothing: Any = 7
-"""Any, because a type checker would refuse these expressions."""
-
-
-@dataclass
-class PlanningActionPerformable(ActionAbstract):
-    """Build an expression of what is none during the perform, and perform it."""
-
-    async def perform(self) -> None:
-        await (well + nothing).perform()
-
-
-async def test_an_expression_that_was_built_wrongly_fails_with_the_reason(tmp_path: Path) -> None:
-    async with recorded(tmp_path):
-        await (PlanningActionPerformable() - NoteActionPerformable("went on")).perform()
-    _, expression, planning, note = await nodes_of(tmp_path)
-    assert statuses([expression, planning, note]) == [
-        ("TryInOrder", "SUCCEEDED"),
-        ("PlanningAction", "FAILED"),
-        ("NoteAction", "SUCCEEDED"),
-    ]
-    reason = "Sequential needs designators or descriptions of actions, got 7"
-    assert (planning.reason, planning.failure_message) == ("NotALanguageExpression", reason)
-    assert planning.failure_arguments == [reason, "7"]
-
 
 async def test_an_empty_alternative_among_others_is_skipped_and_recorded(tmp_path: Path) -> None:
     async with recorded(tmp_path):

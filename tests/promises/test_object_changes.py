@@ -13,17 +13,13 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import Object as ObjectRow
-from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan import (
     ActionAbstract,
-    MoveTorsoActionPerformable,
     NavigateActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
-    SimulatedTaskTree,
 )
-from pycrorm_async.plan.objects import designator_of
-from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose, current_world
+from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import Chronicle, assert_same, read_from_memory
@@ -132,30 +128,6 @@ async def test_concurrent_branches_each_cause_their_own_changes(tmp_path: Path) 
         rows = await every(memory, select(ObjectRow).where(ObjectRow.id != ObjectRow.identity_id))
         caused = [steps[row.node_id] for row in rows]
         assert [(f"moves {row.name}", row.pose.x) for row in rows] == [(step.label, step.step) for step in caused]
-
-
-async def test_a_simulation_changes_nothing_that_is_recorded_as_real(tmp_path: Path) -> None:
-    async with recorded(tmp_path) as memory:
-        real, imagined = Chronicle(), Chronicle()
-        with lab(real) as scene:
-            await NavigateActionPerformable(WITHIN_REACH).perform()
-            with SimulatedTaskTree():
-                copy = current_world.get()
-                assert copy is not None
-                imagined.begin_with(copy.objects)
-                copy.observe(imagined)
-                await PickUpActionPerformable(designator_of(scene.milk), Arms.LEFT, Grasp.FRONT).perform()
-            await MoveTorsoActionPerformable(0.1).perform()
-        await memory.flush()
-        assert real.short()[3:] == [("moved", "pr2", "MoveMotion"), ("joints", "pr2", "MoveJointsMotion")]
-        assert_same((await read_from_memory(memory))[: len(real.entries)], real.entries)
-        entry, _, _, *simulation_entries = await read_from_memory(memory, 2, simulated=True)
-        assert (entry.what[1], entry.what[2][:3]) == ("pr2", (0.6, 0.9, 0))  # it begins with the objects of the world
-        assert_same(simulation_entries[: len(imagined.entries)], imagined.entries)
-        assert ("attached", "pr2", "PickUpAction") in imagined.short()
-        assert await read_from_memory(memory, 2) == []
-        episodes = await every(memory, select(ProcessMetaData).order_by(ProcessMetaData.id), simulated=True)
-        assert [(each.simulated, each.status) for each in episodes] == [(False, "RUNNING"), (True, "SUCCEEDED")]
 
 
 async def test_each_episode_in_one_world_begins_with_all_its_objects(tmp_path: Path) -> None:
