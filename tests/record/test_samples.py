@@ -66,9 +66,8 @@ def test_a_number_takes_less_than_thirty_bytes_on_disk(tmp_path: Path) -> None:
     assert (size() - before) / numbers.size < 30
 
 
-@pytest.mark.parametrize(
-    ("channels", "values", "at"),
-    [
+def test_wrong_samples_are_counted_and_record_nothing(tmp_path: Path) -> None:
+    wrong: list[tuple[Any, Any, Any]] = [
         ([], [], START),
         ("xy", [1.0, 2.0], START),
         (["x"], [1.0, 2.0], START),
@@ -76,13 +75,12 @@ def test_a_number_takes_less_than_thirty_bytes_on_disk(tmp_path: Path) -> None:
         (["x"], ["one"], START),
         (["x"], [1.0], "now"),
         ([7], [1.0], START),
-    ],
-)
-def test_wrong_samples_are_counted_and_record_nothing(tmp_path: Path, channels: Any, values: Any, at: Any) -> None:
+    ]
     with opened(tmp_path) as memory:
         with memory.recording.episode(description="wrong") as episode:
-            episode.sampled("x", channels, values, at)
-        assert memory.status.faults.total == 1
+            for number, each in enumerate(wrong, 1):
+                episode.sampled("x", *each)
+                assert memory.status.faults.total == number
         memory.flush()
         assert memory.ask.streams().rows() == []
 
