@@ -25,7 +25,6 @@ from pycrorm_async.plan import (
     ParkArmsAction,
     PickUpAction,
     PlanFailure,
-    PlanFailures,
     Repeat,
     Sequential,
     TaskStatus,
@@ -200,18 +199,6 @@ async def test_a_failure_ends_a_sequence_and_fails_branches_and_alternatives_go_
     status = TaskStatus.SUCCEEDED if succeeds else TaskStatus.FAILED
     assert (tree.roots[0].status, tree.roots[0].failure) == (status, None if succeeds else failure)
     assert scene.robot.pose.position == pytest.approx((1, 1, 0) if moves else (0, 0, 0))
-
-
-async def test_alternatives_that_all_fail_raise_all_failures() -> None:
-    one, two = PlanFailure("one"), PlanFailure("two")
-
-    def fail(failure: PlanFailure) -> None:
-        raise failure
-
-    for plan in (Code(fail, failure=one) ^ Code(fail, failure=two), Code(fail, failure=one) - Code(fail, failure=two)):
-        with pytest.raises(PlanFailures) as caught:
-            await plan.perform()
-        assert caught.value.exceptions == (one, two)
 
 
 async def test_descriptions_are_resolved_when_they_are_performed(scene: Scene) -> None:

@@ -112,13 +112,6 @@ async def test_one_success_is_enough_for_concurrent_alternatives_and_all_run_to_
     assert log == ["b", "b.", "c", "c."]
 
 
-async def test_a_failed_branch_does_not_stop_the_others() -> None:
-    log: list[str] = []
-    with pytest.raises(PlanFailure):
-        await (failing("a") | Step("b", log, turns=5)).perform()
-    assert log == ["b", "b."]
-
-
 # --- operands ---------------------------------------------------------------------------------------------------------
 
 
@@ -215,12 +208,6 @@ async def test_the_last_failure_is_raised_after_the_last_attempt(scene: Scene) -
     assert len(caught.value.__notes__) == 1
     assert caught.value.__notes__[0].startswith("try 1: TorsoGoalUnreachable: ")
     assert scene.robot.joint_position("torso_lift_joint") == pytest.approx(0.0)
-
-
-async def test_the_last_failure_is_raised_when_the_alternatives_end(scene: Scene) -> None:
-    with pytest.raises(TorsoGoalUnreachable) as caught:
-        await Retry(MoveTorsoAction([5.0, 7.0]), max_tries=10).perform()
-    assert caught.value.data == (7.0,)
 
 
 async def test_a_designator_is_tried_again_and_its_result_returned() -> None:

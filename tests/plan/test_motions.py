@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Mapping
 
 import pytest
 
@@ -46,6 +45,7 @@ from pycrorm_async.plan.failures import (
 from pycrorm_async.world import Arms, BulletWorld, GripperState, Limits, Object, ObjectType, Pose, WorldMode
 from pycrorm_async.world.pose import NoWorld, UnknownJoint, rotated, yaw_quaternion
 from tests.plan.conftest import Scene
+from tests.world.fakes import ChangeLog
 
 # === motions ==================================================================================================
 #
@@ -54,29 +54,12 @@ from tests.plan.conftest import Scene
 LEFT_TOOL = "l_gripper_tool_frame"
 
 
-class Watching:
-    """A world observer that notes the moved objects."""
+class Watching(ChangeLog):
+    """A log of changes in short."""
 
-    def __init__(self) -> None:
-        self.seen: list[str] = []
-
-    def object_added(self, added: Object) -> None:
-        self.seen.append(f"added {added.name}")
-
-    def object_removed(self, removed: Object) -> None:
-        self.seen.append(f"removed {removed.name}")
-
-    def object_moved(self, moved: Object) -> None:
-        self.seen.append(f"moved {moved.name}")
-
-    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
-        self.seen.append(f"joints {len(positions)}")
-
-    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        self.seen.append(f"attached {child.name} to {link}")
-
-    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        self.seen.append(f"detached {child.name} from {link}")
+    @property
+    def seen(self) -> list[str]:
+        return [f"joints {len(note[2])}" if note[0] == "joints" else f"{note[0]} {note[1]}" for note in self.notes]
 
 
 @pytest.fixture
