@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -140,24 +139,16 @@ def test_an_export_of_no_episode_is_refused_with_the_condition(folder: Path) -> 
     assert both.returncode == 2
 
 
-def test_recall_names_the_nearest_type_and_the_range_of_numbers_seen(folder: Path) -> None:
-    url = f"sqlite:///{folder / 'pycrorm.db'}"
-    with Memory.sync(url) as memory:
-        unknown = memory.recall("StepActon")
-        assert "never seen: type StepActon; did you mean StepAction?" in unknown.why()
-        beyond = memory.recall("StepAction", near={"level": 12.0})
-        assert "out of range: level 12; seen are 0.5 to 0.9" in beyond.why()
-        assert memory.recall("StepAction", near={"level": 0.7}).notes == ()
-        assert repr(beyond).startswith("<Answer: ")
-        assert "\n" not in repr(beyond)
-        assert "durations" in repr(memory.ask)
-        assert re.fullmatch(r"MemoryStatus\(.*drained=True, .*\)", repr(memory.status))
-        assert "None" not in repr(memory.status)
-    limited = [
-        pycrorm("recall", "StepAction", option, "2", "--json", cwd=folder).stdout for option in ("--limit", "--k")
-    ]
-    assert [len(json.loads(each)["cases"]) for each in limited] == [2, 2]
-    assert "--limit" in pycrorm("recall", "--help", cwd=folder).stdout
+def test_the_number_of_recalled_actions_has_two_names(folder: Path) -> None:
+    limited = [answer("recall", "StepAction", option, "2", cwd=folder) for option in ("--limit", "--k")]
+    assert [len(each["cases"]) for each in limited] == [2, 2]
+
+
+def test_the_text_of_a_status_and_of_the_questions_has_what_is_present(folder: Path) -> None:
+    with Memory.sync(f"sqlite:///{folder / 'pycrorm.db'}") as memory:
+        status, questions = repr(memory.status), repr(memory.ask)
+    assert (status.startswith("MemoryStatus("), "drained=True" in status, "None" in status) == (True, True, False)
+    assert "durations" in questions
 
 
 def test_a_column_that_the_view_of_all_nodes_has_is_named_with_the_join(folder: Path) -> None:
