@@ -1,12 +1,12 @@
 """Read new events of the log as they are stored, for any number of pages that follow one episode or all of them.
 
-Theory of operation. One task, `LogFollower.run`, asks the log every 50 ms (150 ms if nothing happens) which episodes
-have grown, as long as a page listens, and folds the new events of those that are followed: each `EpisodeFeed` once,
-however many pages show it. After each turn it wakes the listeners, and each takes the part of the document behind the
-event that it has sent last. A feed has a lock, because a part must not be taken while events are folded. The log is
-only read. If the database does not exist yet or does not answer, `fault` has the reason and the task tries again; if
-it was replaced, the feeds are thrown away and `epoch` counts it, and the pages load again. A replica that does not
-answer counts as replaced, by the memory itself; of one that is behind, `fault` has how far.
+Theory of operation. One task, `LogFollower.run`, asks the log every 100 ms which episodes have grown, as long as a page
+listens, and folds the new events of those that are followed: each `EpisodeFeed` once, however many pages show it. After
+each turn it wakes the listeners, and each takes the part of the document behind the event that it has sent last. A feed
+has a lock, because a part must not be taken while events are folded. The log is only read. If the database does not
+exist yet or does not answer, `fault` has the reason and the task tries again; if it was replaced, the feeds are thrown
+away and `epoch` counts it, and the pages load again. A replica that does not answer counts as replaced, by the memory
+itself; of one that is behind, `fault` has how far.
 """
 
 from __future__ import annotations
@@ -50,12 +50,8 @@ from pycrorm_async.store.log import EventLog, episode_named, grown_episodes, is_
 from pycrorm_async.store.replica import lag_line, open_to_read
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
-_INTERVAL_S = 0.05
+_INTERVAL_S = 0.1
 """The pause in s between two reads of the log."""
-_IDLE_INTERVAL_S = 0.15
-"""The pause in s between two reads of a log that did not change for `_IDLE_TURNS` reads."""
-_IDLE_TURNS = 40
-"""The turns without a change after which the log is queried less often, to spare the robot's processor."""
 _RETRY_S = 0.5
 """Delays the next attempt if the database does not answer."""
 _LAG_INTERVAL_S = 5.0
@@ -150,7 +146,6 @@ class LogFollower:
 
     async def run(self) -> None:
         """Follow the log until cancelled; rest while nothing listens."""
-        unchanged = 0
         try:
             while True:
                 await self._wanted.wait()
@@ -161,11 +156,9 @@ class LogFollower:
                 except (DatabaseUnavailable, DatabaseForeign) as error:
                     changed, self.fault = False, str(error)
                     self._is_lost = self._replica is not None
-                unchanged = 0 if changed else unchanged + 1
                 if changed or fault != self.fault:
                     await self._wake()
-                interval_s = _INTERVAL_S if unchanged < _IDLE_TURNS else _IDLE_INTERVAL_S
-                await asyncio.sleep(interval_s if self.fault is None else _RETRY_S)
+                await asyncio.sleep(_INTERVAL_S if self.fault is None else _RETRY_S)
         finally:
             await self.close()
 
