@@ -52,93 +52,53 @@ async def perform_each(log: EventLog, *types: DesignatorTypeDeclared) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "other", "attribute"),
-    [
-        (WAVE, WAVE_MOTION, "WaveMotion", "times"),
-        (WAVE, WAVE_IN_WORDS, "Wave", "times_text"),
-        (WAVE, SAYING_TWIN, "Saying_ActionAction", "times"),
-    ],
-    ids=["a motion after the action", "text after integer", "the table of another"],
+OTHERS = (
+    declared("Jump", "jump", bases=("MoveMotion",)),  # a built-in base of another kind
+    declared("Skip", "skip", bases=("Hop",)),  # a base of another kind, which is declared later
+    declared("Hop", "hop", kind="motion"),
+    declared("Turn", "turn", bases=("Spin",)),  # each is the other's base
+    declared("Spin", "spin", bases=("Turn",)),
+    declared("Bow", "ORMBow", kind="motion"),  # a class of another kind
 )
-async def test_the_later_declaration_has_other_names_and_every_query_has_an_answer(
-    log: EventLog, first: DesignatorTypeDeclared, second: DesignatorTypeDeclared, other: str, attribute: str
-) -> None:
-    await perform_each(log, first, second)
-    assert await log.stopped() == []
-    expected = [("SayingAction", "SayingAction"), ("Wave", "Wave"), (other, other)]
-    kinds = ["action", first.kind, second.kind]
+
+
+async def test_every_query_has_an_answer_whatever_declarations_contradict_each_other(log: EventLog) -> None:
+    """A later declaration gets other names, a refused one parks its episode, bases of another kind are ignored."""
+    await perform_each(log, WAVE, WAVE_MOTION, WAVE_IN_WORDS, SAYING_TWIN, *OTHERS, WAVE_AS_POSE)
+    assert [(each.number, each.parked) for each in await log.stopped()] == [(12, f"event 1: {OF_US}")]
+    actions, motions = ["SayingAction", "Wave", "Wave", "Saying_ActionAction"], ["WaveMotion"]
+    actions += [each.dtype for each in OTHERS if each.kind == "action"]
+    motions += [each.dtype for each in OTHERS if each.kind == "motion"]
     async with Reading.open_address(log.address) as reading:
-        assert await answer_to(reading, select(Designator)) == expected
-        for question, kind in ((select(Action), "action"), (select(Motion), "motion")):
-            answer = [each for each, its in zip(expected, kinds, strict=True) if its == kind]
-            assert await answer_to(reading, question) == answer
+        for question, dtypes in ((Action, actions), (Motion, motions), (ORMBow, [])):
+            assert [dtype for _, dtype in await answer_to(reading, select(question))] == dtypes
+        everything = await answer_to(reading, select(Designator))
+        assert everything[:5] == [
+            (each, each) for each in ("SayingAction", "Wave", "WaveMotion", "Wave", "Saying_ActionAction")
+        ]
         async with reading.session() as session:
-            values = [
-                [getattr(each, name) for each in await session.scalars(select(reading.mapped(dtype)).order_by("id"))]
-                for dtype, name in (("Wave", "times"), (other, attribute))
-            ]
-        recorded = [3 if each.fields[0].type == "integer" else "three" for each in (first, second)]
-        beside = [None] if other == "Wave" else []
-        assert values == [[recorded[0], *beside], [*beside, recorded[1]]]
-    line = (await contradictions(log))[0]
-    assert line.endswith(f" is kept as {attribute if other == 'Wave' else other}")
+            nodes = (await session.scalars(select(TaskTreeNode).order_by(TaskTreeNode.id))).all()
+            assert [each.dtype for each in nodes] == [dtype for _, dtype in everything]
+            assert [each.action and each.action.dtype for each in nodes] == [dtype for _, dtype in everything]
+            for dtype, attribute, values in (
+                ("Wave", "times", [3, None]),
+                ("Wave", "times_text", [None, "three"]),
+                ("WaveMotion", "times", [3]),
+                ("Saying_ActionAction", "times", [3]),
+            ):
+                rows = await session.scalars(select(reading.mapped(dtype)).order_by("id"))
+                assert [getattr(each, attribute) for each in rows] == values, (dtype, attribute)
+    kept = {line.rpartition(" is kept as ")[2] for line in await contradictions(log)}
+    assert kept >= {"WaveMotion", "times_text", "Saying_ActionAction"}
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "parked"),
-    [(WAVE, WAVE_AS_POSE, 3), (WAVE_AS_POSE, WAVE, 2)],
-    ids=["a table of the memory last", "a table of the memory first"],
-)
-async def test_the_refused_declaration_parks_its_episode_and_every_query_has_an_answer(
-    log: EventLog, first: DesignatorTypeDeclared, second: DesignatorTypeDeclared, parked: int
-) -> None:
-    await perform_each(log, first, second)
-    assert [(each.number, each.parked) for each in await log.stopped()] == [(parked, f"event 1: {OF_US}")]
-    async with Reading.open_address(log.address) as reading:
-        for question in (select(Designator), select(Action)):
-            assert await answer_to(reading, question) == [("SayingAction", "SayingAction"), ("Wave", "Wave")]
-        assert await answer_to(reading, select(Motion)) == []
-
-
-async def test_a_type_without_an_accepted_declaration_has_no_class(log: EventLog) -> None:
+async def test_a_type_without_an_accepted_declaration_has_no_class_until_a_later_one_is_accepted(log: EventLog) -> None:
     await perform_each(log, WAVE_AS_POSE)
     async with Reading.open_address(log.address) as reading:
         assert await answer_to(reading, select(Designator)) == [("SayingAction", "SayingAction")]
         with pytest.raises(CallerError, match=r"this memory has no type 'Wave' \(its types: SayingAction\)"):
             reading.mapped("Wave")
-
-
-@pytest.mark.parametrize(
-    "types",
-    [
-        (declared("Jump", "jump", bases=("MoveMotion",)),),
-        (declared("Jump", "jump", bases=("Hop",)), declared("Hop", "hop", kind="motion")),
-        (declared("Jump", "jump", bases=("Hop",)), declared("Hop", "hop", bases=("Jump",))),
-        (declared("Bow", "ORMBow", kind="motion"),),
-    ],
-    ids=[
-        "a built-in base of another kind",
-        "a base of another kind later",
-        "each the other's base",
-        "a class of another kind",
-    ],
-)
-async def test_bases_and_classes_of_another_kind_are_ignored(
-    log: EventLog, types: tuple[DesignatorTypeDeclared, ...]
-) -> None:
-    await perform_each(log, *types)
-    assert await log.stopped() == []
-    everything = [("SayingAction", "action"), *((each.dtype, each.kind) for each in types)]
-    async with Reading.open_address(log.address) as reading:
-        for question, kinds in (
-            (select(Designator), ("action", "motion", "language")),
-            (select(Action), ("action",)),
-            (select(Motion), ("motion",)),
-        ):
-            answer = await answer_to(reading, question)
-            assert [dtype for _, dtype in answer] == [dtype for dtype, kind in everything if kind in kinds]
-        assert await answer_to(reading, select(ORMBow)) == []
-        async with reading.session() as session:
-            nodes = (await session.scalars(select(TaskTreeNode).order_by(TaskTreeNode.id))).all()
-            assert [each.action and each.action.dtype for each in nodes] == [dtype for dtype, _ in everything]
+        wave = Script(3)
+        wave.put(NodeStarted("action", None, name_of(WAVE), {"times": 3}))
+        await stored_and_folded(log, [*declarations(WAVE), *wave.records])
+        assert await answer_to(reading, select(Designator)) == [("SayingAction", "SayingAction"), ("Wave", "Wave")]

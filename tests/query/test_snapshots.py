@@ -370,42 +370,35 @@ async def test_an_invalid_moment_is_refused(reading: Reading) -> None:
             await reading.as_of(1, **when)
 
 
+UNREADABLE: list[tuple[str, bytes | None, int, type[Exception], str]] = [
+    ("NodeEnded", b'{"node":', 1, LogDamaged, f"episode {ID}, event 16: NodeEnded cannot be decoded: "),
+    ("NodeEnded", b'{"node":99,"status":"FAILED"}', 1, LogDamaged, "event 16: node 99 ends and never started"),
+    ("NodeStarted", b'{"kind":"action","parent":99}', 1, LogDamaged, "event 16: its parent 99 never started"),
+    ("EpisodeStarted", None, 1, LogDamaged, "event 16: the episode starts a second time"),
+    ("ObjectRemoved", b'{"object":{"object":5,"row":5}}', 1, LogDamaged, "event 16: object 5 was never added"),
+    ("NodeStarted", b'{"kind":"action","parent":2,"designator":"0f"}', 1, LogDamaged, "type 0f was never declared"),
+    ("NodeEnded", b"{}", 3, DatabaseForeign, "event 16: NodeEnded has version 3, this version reads 2: use a newer"),
+    ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event type of this version: use a newer"),
+]
+
+
 @pytest.mark.slow
 @pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize(
-    ("type_", "payload", "version", "kind", "message"),
-    [
-        ("NodeEnded", b'{"node":', 1, LogDamaged, f"episode {ID}, event 16: NodeEnded cannot be decoded: "),
-        ("NodeEnded", b'{"node":99,"status":"FAILED"}', 1, LogDamaged, "event 16: node 99 ends and never started"),
-        ("NodeStarted", b'{"kind":"action","parent":99}', 1, LogDamaged, "event 16: its parent 99 never started"),
-        ("EpisodeStarted", None, 1, LogDamaged, "event 16: the episode starts a second time"),
-        ("ObjectRemoved", b'{"object":{"object":5,"row":5}}', 1, LogDamaged, "event 16: object 5 was never added"),
-        ("NodeStarted", b'{"kind":"action","parent":2,"designator":"0f"}', 1, LogDamaged, "type 0f was never declared"),
-        (
-            "NodeEnded",
-            b"{}",
-            3,
-            DatabaseForeign,
-            "event 16: NodeEnded has version 3, this version reads 2: use a newer",
-        ),
-        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event type of this version: use a newer"),
-    ],
-)
-async def test_a_snapshot_before_an_unreadable_event_is_given(
-    log: EventLog, type_: str, payload: bytes | None, version: int, kind: type[Exception], message: str
-) -> None:
-    script = Script()
-    for line in STORY[:15]:
-        script.put(line.event)
-    script.put_payload(type_, payload or script.records[0].payload, version)
-    script.put(NodeEnded(2, "SUCCEEDED"))
-    await stored_and_folded(log, [*declarations(*TYPES), *script.records])
+async def test_a_snapshot_before_an_unreadable_event_is_given(log: EventLog) -> None:
+    scripts = [Script(number) for number in range(1, len(UNREADABLE) + 1)]
+    for script, (type_, payload, version, *_) in zip(scripts, UNREADABLE, strict=True):
+        for line in STORY[:15]:
+            script.put(line.event)
+        script.put_payload(type_, payload or script.records[0].payload, version)
+        script.put(NodeEnded(2, "SUCCEEDED"))
+    await stored_and_folded(log, [*declarations(*TYPES), *(record for each in scripts for record in each.records)])
     async with Reading.open_address(log.address) as reading:
-        assert state_of(await reading.as_of(1, sequence=15)) == STORY[14][1:]
-        assert state_of(await reading.as_of(1, time=14.5)) == STORY[14][1:]
-        for when in ({"sequence": 16}, {"time": 1e9}):
-            with pytest.raises(kind, match=message):
-                await reading.as_of(1, **when)
+        for number, (*_, kind, message) in enumerate(UNREADABLE, 1):
+            assert state_of(await reading.as_of(number, sequence=15)) == STORY[14][1:]
+            assert state_of(await reading.as_of(number, time=14.5)) == STORY[14][1:]
+            for when in ({"sequence": 16}, {"time": 1e9}):
+                with pytest.raises(kind, match=message):
+                    await reading.as_of(number, **when)
 
 
 @pytest.mark.slow

@@ -48,10 +48,10 @@ def record(memory: Any, episode: RecordedEpisode) -> None:
     episode.end("two", "FAILED", "é" * 500_000)
 
 
-@pytest.fixture
-def url(tmp_path: Path) -> str:
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return the URL of a memory with one recorded episode."""
-    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    url = f"sqlite:///{tmp_path_factory.mktemp('document') / 'memory.db'}"
     with Memory.sync(url) as memory:
         with memory.recording.episode(description=HOSTILE) as episode:
             record(memory, episode)
@@ -100,7 +100,10 @@ async def test_a_document_has_every_node_object_observation_and_time(url: str) -
     assert len(document["times"]) == document["episode"]["head"]
 
 
-async def test_a_robot_without_a_description_is_a_body_of_human_scale_and_another_object_a_point(url: str) -> None:
+async def test_a_robot_without_a_description_is_a_body_of_human_scale_and_others_a_point(
+    tmp_path: Path,
+) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
     with Memory.sync(url) as memory:
         with memory.recording.episode() as episode:
             record(memory, episode)
