@@ -3,11 +3,12 @@
     python -m bench.tasks                     60 tasks, all rows, without and with errors of the robot
     python -m bench.tasks --tasks 200 --kept tasks.jsonl      continues after an interruption
     python -m bench.tasks --only "model, checked" --errors none
+    python -m bench.tasks --robots pr2 tiago_pro      the same tasks for each, with a model of its own
 
 Each task is drawn from (seed, number): two tables of 0.7 m by 1.4 m, 0.5 to 1.1 m high and turned at random, 3.2 m
 apart; milk, cereal or pringles 8 to 25 cm behind the edge of one, turned at random; its goal as far behind the
 edge of the other, with another heading. The arms are parked, the torso is at 0.2 m, collisions of base,
-arm and held object count, and the gripper opens 8.6 cm. `Retry` has five tries.
+arm and held object count, and the gripper opens 8.6 cm, that of a TIAGo Pro 7.9 cm. `Retry` has five tries.
 
 | row | how to pick up and where to place |
 |---|---|
@@ -76,7 +77,7 @@ from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, Limits
+from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
 
 TRIES = 5
 BATCH = 5
@@ -148,10 +149,10 @@ class Kitchen:
             self.modules.rng = np.random.default_rng((seed, number, 2))
         description = self.robot.robot_description
         assert description is not None
-        assert description.torso_joint is not None
         for each in description.arms.values():
             self.robot.set_joint_positions(dict(each.park))
-        self.robot.set_joint_position(description.torso_joint, TORSO_M)
+        if description.torso_joint is not None:
+            self.robot.set_joint_position(description.torso_joint, TORSO_M)
         thing = self.things[rng.integers(len(self.things))]
         underside = thing.bounding_box().min.z - thing.pose.position.z
         places = []
@@ -165,12 +166,12 @@ class Kitchen:
 
 
 @contextmanager
-def kitchen(errors: Disturbance) -> Iterator[Kitchen]:
+def kitchen(errors: Disturbance, robot_name: str = PR2.name) -> Iterator[Kitchen]:
     modules = SimulatedModules(Limits.SOFT, collisions=True)
     if errors != Disturbance():
         modules = DisturbedModules(Limits.SOFT, errors, collisions=True)
     with BulletWorld(), ChosenRobot("tasks", modules, collisions=True):
-        robot = Object("pr2", ObjectType.ROBOT)
+        robot = Object(robot_name, ObjectType.ROBOT)
         urdf = box_urdf("table", x=(-0.35, 0.35), y=(-0.7, 0.7), z=(-2.0, 0.0))
         one, other = (Object(f"table_{number}", ObjectType.ENVIRONMENT, urdf) for number in range(2))
         away = [Pose((50.0 + number, 50.0, 0.0)) for number in range(len(OBJECTS))]
@@ -194,7 +195,7 @@ class Ended:
 
 
 def transport(row: str, model: AnyPolicy | None, thing: Object, goal: Pose, rng: np.random.Generator) -> Any:
-    arms = [Arms.LEFT, Arms.RIGHT]
+    arms = [*require_robot().description.arms]
     if row == "TransportAction":
         return TransportAction(thing, (arms * TRIES)[:TRIES], [goal])
     ways = TransportPolicy(model if row.startswith("model") else None, checked=row.endswith("checked"), rng=rng)
@@ -270,12 +271,19 @@ def solvable(here: Kitchen, seed: int, number: int) -> bool:
     return any(places(hold, turn) for turn in around for hold in able)
 
 
-def job(row: str, model_file: str | None, errors: Disturbance, seed: int, numbers: Sequence[int]) -> list[Any]:
+def job(
+    row: str,
+    model_file: str | None,
+    errors: Disturbance,
+    seed: int,
+    numbers: Sequence[int],
+    robot_name: str = PR2.name,
+) -> list[Any]:
     """Return how these tasks ended, of the row "ceiling" whether they can be solved; run in a process of its own."""
 
     async def ended() -> list[Any]:
         model = load_policy(model_file) if model_file is not None else None
-        with kitchen(errors) as here:
+        with kitchen(errors, robot_name) as here:
             if row == "ceiling":
                 return [solvable(here, seed, number) for number in numbers]
             return [await performed(row, model, here, seed, number) for number in numbers]
@@ -284,7 +292,7 @@ def job(row: str, model_file: str | None, errors: Disturbance, seed: int, number
 
 
 class Kept:
-    """The ends of tasks that were measured before, by row, errors, seed and number, in a file of JSON lines."""
+    """The ends of tasks that were measured before, by robot, row, errors, seed and number, in a file of JSON lines."""
 
     def __init__(self, file: Path | None) -> None:
         self._file = file
@@ -293,18 +301,18 @@ class Kept:
             for line in file.read_text().splitlines():
                 with suppress(ValueError):  # the last line of a run that was killed
                     *key, end = json.loads(line)
-                    self._ends[tuple(key)] = end
+                    self._ends[tuple(key if len(key) > 5 else (PR2.name, *key))] = end  # of one robot, formerly
 
     def of(self, key: tuple[Any, ...], number: int) -> Any:
         end = self._ends.get((*key, number))
         return Ended(**end) if isinstance(end, dict) else end
 
-    def solved(self, seed: int) -> set[int]:
+    def solved(self, robot_name: str, seed: int) -> set[int]:
         """Return the tasks in which a row without errors placed the object."""
         return {
             number
-            for (_, errors, _, own_seed, number), end in self._ends.items()
-            if isinstance(end, dict) and end["placed"] and not errors and own_seed == seed
+            for (robot, _, errors, _, own_seed, number), end in self._ends.items()
+            if isinstance(end, dict) and end["placed"] and not errors and (robot, own_seed) == (robot_name, seed)
         }
 
     def add(self, key: tuple[Any, ...], numbers: Sequence[int], ends: Sequence[Any]) -> None:
@@ -323,13 +331,14 @@ def measure(
     seed: int,
     numbers: Sequence[int],
     workers: int,
+    robot_name: str,
 ) -> list[Any]:
     """Return how each of these tasks ended; the same for any number of workers."""
-    key = row, str(errors), Path(model_file).name if model_file is not None else "", seed
+    key = robot_name, row, str(errors), Path(model_file).name if model_file is not None else "", seed
     missing = [number for number in numbers if kept.of(key, number) is None]
     with ProcessPoolExecutor(workers, mp_context=get_context("forkserver")) as pool:
         running = {
-            pool.submit(job, row, model_file, errors, seed, some): some
+            pool.submit(job, row, model_file, errors, seed, some, robot_name): some
             for some in (missing[first : first + BATCH] for first in range(0, len(missing), BATCH))
         }
         left = len(missing)
@@ -337,7 +346,7 @@ def measure(
             kept.add(key, running[each], each.result())
             left -= len(running[each])
             done = f"{len(numbers) - left} of {len(numbers)} tasks"
-            print(f"{row}, {str(errors) or 'no errors'}: {done}", file=sys.stderr, flush=True)
+            print(f"{robot_name}, {row}, {str(errors) or 'no errors'}: {done}", file=sys.stderr, flush=True)
     return [kept.of(key, number) for number in numbers]
 
 
@@ -366,14 +375,54 @@ def show(figures: dict[str, Any]) -> None:
     names = "first_try", "picked", "placed", "placed_of_solvable"
     counts = "failed_per_100", "all_tries_per_100", "all_tries_per_100_solvable"
     headings = "first try", "picked in 5", "placed", "placed of solvable"
-    table = Table("errors", "row", *headings, "failed tries per 100", "all tries", "all, per 100 solvable")
+    table = Table("robot", "errors", "row", *headings, "failed tries per 100", "all tries", "all, per 100 solvable")
     for each in figures["rows"]:
         shares = ["{:.0%} ({:.0%}-{:.0%})".format(*each[name]) if name in each else "" for name in names]
-        table.add_row(each["errors"], each["row"], *shares, *(str(each.get(name, "")) for name in counts))
-    table.caption = "{:.1%} ({:.1%}-{:.1%}) of the tasks can be solved".format(*figures["solvable"])
-    if figures["not_solvable"]:
-        table.caption += "; not solvable: " + ", ".join(map(str, figures["not_solvable"]))
+        table.add_row(
+            each["robot"], each["errors"], each["row"], *shares, *(str(each.get(name, "")) for name in counts)
+        )
+    lines = []
+    for robot_name, each in figures["solvable"].items():
+        lines.append("{:.1%} ({:.1%}-{:.1%}) of the tasks can be solved by ".format(*each["share"]) + robot_name)
+        if each["not"]:
+            lines[-1] += ", all but " + ", ".join(map(str, each["not"]))
+    table.caption = "\n".join(lines)
     Console(stderr=True, width=160).print(table)
+
+
+def compared(
+    arguments: argparse.Namespace, robot_name: str, kept: Kept, rows: Sequence[str], tasks: int, rollouts: int
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return which tasks this robot can solve, and the figures of each row."""
+    ends: dict[tuple[str, str], list[Ended]] = {}
+    with tempfile.TemporaryDirectory(prefix="tasks_") as temporary:
+        folder = arguments.models or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, errors in (("none", Disturbance()), ("all", ERRORS)):
+            if arguments.errors not in (None, name) or not rows:
+                continue
+            file = folder / f"{'' if robot_name == PR2.name else robot_name + '_'}tasks_{name}_{rollouts}.json"
+            if any(row.startswith("model") for row in rows) and not file.exists():
+                learning = f"{robot_name}: learning from {ROUNDS * rollouts} pick-ups, errors: {name}"
+                print(learning, file=sys.stderr, flush=True)
+                scene = replace(LEARNING, disturbance=errors, robot=robot_name)
+                save_policy(asyncio.run(learned(scene, 1_000, rollouts=rollouts)), file)
+            for row in rows:
+                used = str(file) if row.startswith("model") else None
+                ends[name, row] = measure(
+                    kept, row, used, errors, arguments.seed, range(tasks), arguments.workers, robot_name
+                )
+    able = kept.solved(robot_name, arguments.seed)
+    rest = [number for number in range(tasks) if number not in able]
+    searched = measure(kept, "ceiling", None, Disturbance(), arguments.seed, rest, arguments.workers, robot_name)
+    able |= {*compress(rest, searched)}
+    flags = [number in able for number in range(tasks)]
+    solvable = {"share": share(flags), "not": [number for number in rest if number not in able]}
+    measured = [
+        {"robot": robot_name, "errors": name, "row": row, **figures_of(ended, flags)}
+        for (name, row), ended in ends.items()
+    ]
+    return solvable, measured
 
 
 def main() -> None:
@@ -384,6 +433,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", choices=(*ROWS, "ceiling"), help="one row")
     parser.add_argument("--errors", choices=("none", "all"), help="without or with errors of the robot; default both")
+    parser.add_argument("--robots", nargs="+", default=[PR2.name], help="names of robots; default pr2")
     parser.add_argument("--rollouts", type=int, default=ROLLOUTS, help=f"pick-ups of a round; default {ROLLOUTS}")
     parser.add_argument("--models", type=Path, help="folder in which models are kept, to be used again")
     parser.add_argument("--kept", type=Path, help="file of ended tasks: a further run with it continues; of this code")
@@ -392,32 +442,11 @@ def main() -> None:
     if min(tasks, rollouts, arguments.workers) < 1:
         parser.error("--tasks, --rollouts and --workers must be 1 or more")
     rows = [row for row in ROWS if arguments.only in (None, row)]
-    figures: dict[str, Any] = {"bench": "tasks", "tasks": tasks, "seed": arguments.seed, "rows": []}
+    figures: dict[str, Any] = {"bench": "tasks", "tasks": tasks, "seed": arguments.seed, "solvable": {}, "rows": []}
     kept = Kept(arguments.kept)
-    ends: dict[tuple[str, str], list[Ended]] = {}
-    with tempfile.TemporaryDirectory(prefix="tasks_") as temporary:
-        folder = arguments.models or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, errors in (("none", Disturbance()), ("all", ERRORS)):
-            if arguments.errors not in (None, name) or not rows:
-                continue
-            file = folder / f"tasks_{name}_{rollouts}.json"
-            if any(row.startswith("model") for row in rows) and not file.exists():
-                print(f"learning from {ROUNDS * rollouts} pick-ups, errors: {name}", file=sys.stderr, flush=True)
-                model = asyncio.run(learned(replace(LEARNING, disturbance=errors), 1_000, rollouts=rollouts))
-                save_policy(model, file)
-            for row in rows:
-                used = str(file) if row.startswith("model") else None
-                ends[name, row] = measure(kept, row, used, errors, arguments.seed, range(tasks), arguments.workers)
-    able = kept.solved(arguments.seed)
-    rest = [number for number in range(tasks) if number not in able]
-    searched = measure(kept, "ceiling", None, Disturbance(), arguments.seed, rest, arguments.workers)
-    able |= {*compress(rest, searched)}
-    figures["not_solvable"] = [number for number in rest if number not in able]
-    flags = [number in able for number in range(tasks)]
-    figures["solvable"] = share(flags)
-    for (name, row), ended in ends.items():
-        figures["rows"].append({"errors": name, "row": row, **figures_of(ended, flags)})
+    for robot_name in arguments.robots:
+        figures["solvable"][robot_name], measured = compared(arguments, robot_name, kept, rows, tasks, rollouts)
+        figures["rows"] += measured
     show(figures)
     print(json.dumps(figures))
 

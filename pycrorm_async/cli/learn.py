@@ -21,6 +21,7 @@ from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import JsonOption, note, print_facts, print_json, print_table
 from pycrorm_async.cli.policy import percent, print_card
 from pycrorm_async.cli.reading import DEFAULT_URL, ReadingPlace
+from pycrorm_async.cli.run import import_file
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
 from pycrorm_async.learning import remembered
@@ -48,7 +49,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.engines import engine_class
-from pycrorm_async.world.urdf import Limits
+from pycrorm_async.world.urdf import PR2, TIAGO_PRO, Limits, RobotDescription, robot_description
 
 LEAVES = {Learned.PLACES: 25, Learned.POLAR: 20, Learned.SUCCESS: 10}
 """The rows in a leaf, unless others are chosen."""
@@ -86,6 +87,13 @@ def learn(
             help="Limits of the object's height in m, drawn for each rollout, as is its heading; else it is at 0.9 m.",
         ),
     ] = None,
+    robot: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="The robot: pr2, courier, tiago_pro (extra 'pr2'), or FILE.py:NAME of a `RobotDescription` in a file.",
+        ),
+    ] = PR2.name,
     tables: Annotated[
         bool, typer.Option("--tables", help="Put the object on a table, drawn for each rollout: use --collisions too.")
     ] = False,
@@ -220,6 +228,7 @@ def learn(
         table=tables,
         parked=parked,
         disturbance=Disturbance(base_m, math.radians(base_deg), object_m, math.radians(object_deg), slip),
+        robot=_robot(robot),
     )
     experiment = Experiment(
         model=model,
@@ -260,6 +269,22 @@ def learn(
     _print(learned, in_kitchen, studied)
     option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(place.place.address.to_type)}"
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
+
+
+def _robot(reference: str) -> str | RobotDescription:
+    """Return a known name, or the description in `FILE.py:NAME`. Raises `CallerError`."""
+    file, colon, name = reference.rpartition(":")
+    if colon:
+        if not (path := Path(file)).is_file():
+            raise CallerError(f"--robot {reference}: the file {file!r} does not exist")
+        described = getattr(import_file(path), name, None)
+        if not isinstance(described, RobotDescription):
+            raise CallerError(f"--robot {reference}: the file has no RobotDescription {name!r}: describe it there")
+        return described
+    if robot_description(reference) is None:
+        extra = ", which needs pip install 'pycrorm-async[pr2]'" if reference == TIAGO_PRO else ""
+        raise CallerError(f"--robot {reference} is not known{extra}: pr2, courier, tiago_pro or FILE.py:NAME")
+    return reference
 
 
 def _given_options(context: typer.Context) -> list[str]:
@@ -350,7 +375,7 @@ async def _run(
         studied = None
         if study_rollouts:
             studied = await study(experiment, learned, place, rollouts=study_rollouts, report_progress=report_progress)
-        kitchen = replace(KITCHEN, limits=experiment.scene.limits)
+        kitchen = replace(KITCHEN, limits=experiment.scene.limits, robot=experiment.scene.robot)
         return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed, scene=kitchen), studied
 
 

@@ -303,7 +303,7 @@ def load_plan(reference: str) -> LoadedPlan:
     if not path.is_file():
         raise PlanNotLoadable(f"the plan file {path_text!r} does not exist")
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    module = _import_file(path)
+    module = import_file(path)
     function = getattr(module, function_name, None)
     if function is None:
         functions = [name for name, each in vars(module).items() if inspect.iscoroutinefunction(each)]
@@ -322,7 +322,7 @@ def load_plan(reference: str) -> LoadedPlan:
     return LoadedPlan(f"{path.name}:{function_name}", function, bool(required), path, sha256)
 
 
-def _import_file(path: Path) -> Any:
+def import_file(path: Path) -> Any:
     name = path.stem
     if name in sys.modules or name in sys.stdlib_module_names:
         raise PlanNotLoadable(f"{path} has the name of a standard or already loaded module: rename the file")

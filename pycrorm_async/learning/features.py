@@ -208,6 +208,15 @@ def place_of(arm: Arms, grasp: Grasp, distance: float, angle: float) -> tuple[fl
     return distance * math.cos(bearing), distance * math.sin(bearing)
 
 
+def robot_of(frame: pd.DataFrame) -> str | None:
+    """Return the robot of recorded pick-ups; None if they name none. Raises `CallerError` if they are of several."""
+    robots = set(frame["robot"].dropna()) if "robot" in frame.columns else set()
+    if len(robots) > 1:
+        names = ", ".join(sorted(robots))
+        raise CallerError(f"the pick-ups are of several robots ({names}): select those of one (view.robot == …)")
+    return robots.pop() if robots else None
+
+
 def labels(frame: pd.DataFrame, name: str, members: Sequence[str]) -> list[str]:
     """Return a column of names. Raises `CallerError` if it is missing or holds a name that is not in `members`."""
     found: list[str] = _column(frame, name).tolist()

@@ -293,12 +293,13 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return f"MoveAndPickUp({self.target.name!r}, policy={self.policy_name})"
 
     @staticmethod
-    def query_for_database() -> Select[Arms, Grasp, float, float, float | None]:
+    def query_for_database() -> Select[Arms, Grasp, float, float, float | None, str | None]:
         """Select the successful pick-ups of all episodes, the input of `learn`.
 
         A data frame of it has the columns arm, grasp, object_x, object_y (the robot's position in the object's own
-        frame, m) and height (of the object over the lifted torso, m). Add a `where` to cut it, by columns of
-        `PickUpWithContextView` such as `robot`, `description` and `scene` (of the episode) or `obj_type`.
+        frame, m), height (of the object over the lifted torso, m) and robot, of which there must be one to learn. Add a
+        `where` to cut it, by columns of `PickUpWithContextView` such as `robot`, `description` and `scene` (of the
+        episode) or `obj_type`. The height of a robot without a torso is that over its base.
         """
         view = PickUpWithContextView
         return select(
@@ -306,15 +307,16 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             view.grasp,
             view.robot_in_object_x.label("object_x"),
             view.robot_in_object_y.label("object_y"),
-            view.height_over_torso.label("height"),
+            func.coalesce(view.height_over_torso, -view.robot_in_object_z).label("height"),
+            view.robot,
         ).where(view.status == TaskStatus.SUCCEEDED)
 
     @staticmethod
     def query_with_failures() -> Select[Arms, Grasp, float, float, float, float | None, TaskStatus, str | None]:
         """Select the pick-ups of all episodes that succeeded or failed, the input of `SuccessModel.fit`.
 
-        A data frame of it has the columns of `query_for_database` and torso_height (m), status and robot. The height
-        of a robot without a torso is that over its base. It can be cut in the same way.
+        A data frame of it has the columns of `query_for_database`, torso_height (m) and status. It can be cut in the
+        same way.
         """
         view = PickUpWithContextView
         return select(
@@ -365,6 +367,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return frozenset(lifting) if len(lifting) < len(allowed) else None
 
     def _condition(self, evidence: Evidence, where: str) -> Policy:
+        self._check_robot(self._passed_policy)
         try:
             return self.policy.condition(evidence)
         except ImpossibleCondition as impossible:
@@ -438,12 +441,15 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return self._predicted(self._model, [choice], self.context_for(self._model))[0]
 
     def context_for(self, model: AnyPolicy) -> PickUpContext:
-        """Return the object's context for the robot. Raises `CallerError` for a success model of another robot."""
-        robot = objects.require_robot()
-        if isinstance(model, SuccessModel) and model.robot not in (None, robot.body.name, robot.description.name):
-            message = f"the success model {self.policy_name} was fitted to pick-ups of {model.robot}"
-            raise CallerError(f"{message}, this robot is {robot.body.name}: pass a model of this robot")
+        """Return the object's context for the robot. Raises `CallerError` for a policy of another robot."""
+        self._check_robot(model)
         return context_of(objects.in_world(self.target))
+
+    def _check_robot(self, policy: AnyPolicy) -> None:
+        robot = objects.require_robot()
+        if policy.robot not in (None, robot.body.name, robot.description.name):
+            message = f"the policy {self.policy_name} was learned from pick-ups of {policy.robot}"
+            raise CallerError(f"{message}, this robot is {robot.body.name}: pass a policy of this robot")
 
     def _polar_ways(
         self, model: PolarPolicy, rng: np.random.Generator, count: int, context: PickUpContext, policy: Policy

@@ -67,17 +67,26 @@ class PolarLeaf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"a leaf needs 2 probabilities >= 0 that sum to 1, got probabilities {self.kinds}")
 
 
-class PolarPolicy(msgspec.Struct, frozen=True, tag_field="kind", tag="polar policy", forbid_unknown_fields=True):
+class PolarPolicy(
+    msgspec.Struct,
+    frozen=True,
+    tag_field="kind",
+    tag="polar policy",
+    forbid_unknown_fields=True,
+    omit_defaults=True,  # so that the name of a policy of an earlier version stays
+):
     """A distribution over `PickUpChoice` in a context.
 
     Attributes:
         features, features_version: name and version of the features (`features.GRASP_POLAR`).
         leaves: their weights sum to one, and they do not overlap.
+        robot: the name of the robot whose pick-ups it was learned from; None if it is not known.
     """
 
     features: str
     features_version: int
     leaves: tuple[PolarLeaf, ...]
+    robot: str | None = None
 
     def __post_init__(self) -> None:
         if not math.isclose(sum(leaf.weight for leaf in self.leaves), 1, rel_tol=1e-6):

@@ -325,6 +325,7 @@ class Policy:
         evidence: the condition.
         constant_height: the height over the torso, m, if all samples it was learned from had the same one. Such a
             policy applies to every height; its success at other heights is not known.
+        robot: the name of the robot whose pick-ups it was learned from; None if it is not known.
 
     Raises `ImpossibleCondition` if the evidence has probability 0.
     """
@@ -332,6 +333,7 @@ class Policy:
     leaves: tuple[Leaf, ...]
     evidence: Evidence = field(default_factory=Evidence)
     constant_height: float | None = None
+    robot: str | None = None
 
     def __post_init__(self) -> None:
         if not self._mass > 0:

@@ -12,8 +12,8 @@ from an untrusted source cannot run code. Reading a policy and sampling it need 
 needs.
 
 A tree of places is written in version 1, which earlier releases read. The others have version 2: the second line opens
-with their `kind` and has the name and version of the features they were learned with. The memory holds the second line
-alone, as the content that the name of a policy is the hash of.
+with their `kind` and has the name and version of the features they were learned with. A tree that names its robot has
+version 3. The memory holds the second line alone, as the content that the name of a policy is the hash of.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ AnyPolicy: TypeAlias = Policy | PolarPolicy | SuccessModel
 """All that chooses pick-ups: a tree of places, a tree of polar features, or a model of their success."""
 
 FORMAT = "pycrorm policy"
-VERSION = 2
+VERSION = 3
 
 
 class _Heading(msgspec.Struct, frozen=True):
@@ -62,6 +62,7 @@ class _Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     leaves: tuple[Leaf, ...]
     evidence: _Evidence
     constant_height: float | None
+    robot: str | msgspec.UnsetType | None = msgspec.UNSET
 
 
 class _Kind(msgspec.Struct, frozen=True):
@@ -82,7 +83,9 @@ def save_policy(policy: AnyPolicy, path: Path | str) -> None:
     Raises `PolicyFileRefused` if the file cannot be written.
     """
     path, content = Path(path), encode_policy(policy)
-    version = 1 if isinstance(policy, Policy) else VERSION
+    version = 1 if isinstance(policy, Policy) else 2
+    if policy.robot is not None and not isinstance(policy, SuccessModel):
+        version = 3
     heading = msgspec.json.encode(_Heading(FORMAT, version, zlib.crc32(content)))
     temporary = path.parent / f".{path.name}.{os.getpid()}"
     try:
@@ -109,6 +112,7 @@ def encode_policy(policy: AnyPolicy) -> bytes:
             policy.leaves,
             _encode_evidence(policy.evidence),
             policy.constant_height,
+            msgspec.UNSET if policy.robot is None else policy.robot,
         )
     )
 
@@ -167,6 +171,7 @@ def decode_policy(encoded: bytes) -> AnyPolicy:
             height=evidence.height,
         ),
         content.constant_height,
+        content.robot or None,
     )
 
 

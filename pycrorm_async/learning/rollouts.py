@@ -63,8 +63,8 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None, predi
 
     A data frame of it has the columns policy, index, status, failure, arm, grasp, object_x, object_y, height (as
     in `MoveAndPickUp.query_for_database`) and goals: the number of goals the hand was given. If the robot did not reach
-    its place, object_x, object_y and height are missing. With `predicted` it also has robot and the recorded parameters
-    of each rollout as JSON, for `with_parameters`.
+    its place, object_x, object_y and height are missing. The last one is robot. With `predicted` it also has the
+    recorded parameters of each rollout as JSON, for `with_parameters`.
     """
     batch, node, view, move = BatchRolloutAction, TaskTreeNode, PickUpWithContextView, MoveAndPickUpAction
     episode = attrgetter("process_metadata_id")
@@ -80,7 +80,8 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None, predi
             tried.reason,
             batch.policy,
             (batch.first + number - 1).label("index"),
-            *([recorded.label("parameters"), tried.robot] if predicted else ()),
+            tried.robot,
+            *([recorded.label("parameters")] if predicted else ()),
         )
         .join(node, and_(node.id == batch.id, episode(node) == episode(batch)))
         .join(tried, and_(tried.parent_id == node.id, episode(tried) == episode(node)))
@@ -105,9 +106,10 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None, predi
             move.grasp,
             view.robot_in_object_x.label("object_x"),
             view.robot_in_object_y.label("object_y"),
-            view.height_over_torso.label("height"),
+            func.coalesce(view.height_over_torso, -view.robot_in_object_z).label("height"),
             func.coalesce(goals, 0).label("goals"),
-            *([rollout.c.parameters, rollout.c.robot] if predicted else ()),
+            rollout.c.robot,
+            *([rollout.c.parameters] if predicted else ()),
         )
         .select_from(rollout)
         .join(move, and_(move.id == rollout.c.id, episode(move) == rollout.c.process_metadata_id))

@@ -26,7 +26,7 @@ from pycrorm_async.world.bounding_boxes import box_around
 from pycrorm_async.world.bullet import BulletWorld, Object
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import Arms, GripperState, ObjectType, Pose, yaw_quaternion
-from pycrorm_async.world.urdf import Limits
+from pycrorm_async.world.urdf import PR2, Limits, RobotDescription
 
 # === disturbance ==============================================================================================
 #
@@ -187,6 +187,7 @@ class Scene:
             behind the middle 0.8 m of its long edge.
         parked: whether the arms are parked at the start of every rollout; otherwise their joints are at 0.
         disturbance: the errors of the robot.
+        robot: the name of a built-in or registered robot, or a description of one, which processes of workers get too.
     """
 
     name: str = "milk"
@@ -203,6 +204,7 @@ class Scene:
     table: bool = False
     parked: bool = False
     disturbance: Disturbance = field(default_factory=Disturbance)
+    robot: str | RobotDescription = PR2.name
 
     def __post_init__(self) -> None:
         if self.heights is not None and not 0 <= self.heights[0] <= self.heights[1] < math.inf:
@@ -223,6 +225,8 @@ class Scene:
         elif self.yaw:
             parts.append(f"turned by {_digits(math.degrees(self.yaw))}°")
         parts.append(f"torso at {_digits(self.torso_height)} m")
+        if self.robot_name != PR2.name:
+            parts.append(f"robot {self.robot_name}")
         parts.append(f"{self.limits.name.lower()} limits")
         if self.collisions:
             parts.append("collisions count")
@@ -237,6 +241,11 @@ class Scene:
         return ", ".join(parts)
 
     @property
+    def robot_name(self) -> str:
+        """The name of the robot, in the world and in its description."""
+        return self.robot if isinstance(self.robot, str) else self.robot.name
+
+    @property
     def varies(self) -> bool:
         """Return whether rollouts differ by more than the sampled choice."""
         return bool(self.heights or self.turned or self.others or self.table or self.disturbance != Disturbance())
@@ -249,7 +258,8 @@ class Scene:
             modules = DisturbedModules(self.limits, self.disturbance, collisions=self.collisions)
         chosen = ChosenRobot("simulated", modules, limits=self.limits, collisions=self.collisions)
         with BulletWorld() as world, chosen:
-            robot = Object("pr2", ObjectType.ROBOT)
+            described = None if isinstance(self.robot, str) else self.robot
+            robot = Object(self.robot_name, ObjectType.ROBOT, robot=described)
             if self.kitchen:
                 Object("kitchen", ObjectType.ENVIRONMENT)
             pose = Pose(self.position, yaw_quaternion(self.yaw))

@@ -36,6 +36,7 @@ from pycrorm_async.learning.features import (
     PickUpContext,
     features_of,
     features_of_frame,
+    robot_of,
 )
 from pycrorm_async.learning.policy import Floats, PickUpChoice
 from pycrorm_async.task_status import TaskStatus
@@ -155,10 +156,7 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
         if min_samples_leaf < 1:
             raise CallerError(f"a leaf needs one row or more, got min_samples_leaf={min_samples_leaf}")
         ended = _ended(tries)
-        robots = set(ended["robot"].dropna()) if "robot" in ended.columns else set()
-        if len(robots) > 1:
-            names = ", ".join(sorted(robots))
-            raise CallerError(f"the pick-ups are of several robots ({names}): select those of one (view.robot == …)")
+        robot = robot_of(ended)
         succeeded = (ended["status"] == TaskStatus.SUCCEEDED.value).to_numpy()
         successes = int(succeeded.sum())
         for kind, count in (("successes", successes), ("failures", len(ended) - successes)):
@@ -166,7 +164,6 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
                 message = f"{count} {kind} are too few to learn from: a success model needs {EACH_CLASS_MIN} successes"
                 raise NotEnoughExperience(f"{message} and as many failures; {_remedy(tries)}")
         baseline, trees = _fit(features_of_frame(ended), succeeded, min_samples_leaf)
-        robot = robots.pop() if robots else None
         name, version = GRASP_POLAR, GRASP_POLAR_VERSION
         return cls(name, version, baseline, trees, robot, len(ended), successes)
 

@@ -258,17 +258,15 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> PR2Arm:
         upper_arm_m=0.4,
         forearm_m=0.321,
         tool_m=0.18,
-        soft_limits=MappingProxyType(dict(zip(joints, soft, strict=True))),
-        hard_limits=MappingProxyType(dict(zip(joints, hard, strict=True))),
-        gripper_joints=MappingProxyType(
-            {
-                GripperState.OPEN: MappingProxyType(dict.fromkeys(fingers, FINGER_OPEN_RAD)),
-                GripperState.CLOSE: MappingProxyType(dict.fromkeys(fingers, 0.0)),
-            }
-        ),
+        soft_limits=dict(zip(joints, soft, strict=True)),
+        hard_limits=dict(zip(joints, hard, strict=True)),
+        gripper_joints={
+            GripperState.OPEN: dict.fromkeys(fingers, FINGER_OPEN_RAD),
+            GripperState.CLOSE: dict.fromkeys(fingers, 0.0),
+        },
         opening_m=0.086,
         payload_kg=1.8,  # Willow Garage, "Hardware Systems": willowgarage.com/pages/robots/hardware-systems
-        park=MappingProxyType(dict(zip(joints, park, strict=True))),
+        park=dict(zip(joints, park, strict=True)),
     )
 
 
@@ -277,12 +275,10 @@ PR2 = PR2Description(
     torso_joint="torso_lift_joint",
     torso_origin=Vector(-0.05, 0.0, 0.051 + 0.739675),
     torso_limits=Bounds(0.0, 0.33),
-    arms=MappingProxyType(
-        {
-            Arms.LEFT: _pr2_arm("l", 1.0, (1.712, -0.264, 1.38, -2.12, 16.996, -0.073, 0.0)),
-            Arms.RIGHT: _pr2_arm("r", -1.0, (-1.712, -0.256, -1.463, -2.12, 1.766, -0.07, 0.051)),
-        }
-    ),
+    arms={
+        Arms.LEFT: _pr2_arm("l", 1.0, (1.712, -0.264, 1.38, -2.12, 16.996, -0.073, 0.0)),
+        Arms.RIGHT: _pr2_arm("r", -1.0, (-1.712, -0.256, -1.463, -2.12, 1.766, -0.07, 0.051)),
+    },
     head_joints=("head_pan_joint", "head_tilt_joint"),
     head_pan_joint="head_pan_joint",
     head_pan_link="head_pan_link",
@@ -302,24 +298,20 @@ _COURIER_FINGERS = ("left_finger_joint", "right_finger_joint")
 COURIER = RobotDescription(
     name="courier",
     drive=Drive.DIFFERENTIAL,
-    arms=MappingProxyType(
-        {
-            Arms.RIGHT: ArmDescription(
-                joints=_COURIER_JOINTS,
-                base_link="column_link",
-                tool_frame="tool_frame",
-                gripper_joints=MappingProxyType(
-                    {
-                        GripperState.OPEN: MappingProxyType(dict.fromkeys(_COURIER_FINGERS, 0.045)),
-                        GripperState.CLOSE: MappingProxyType(dict.fromkeys(_COURIER_FINGERS, 0.0)),
-                    }
-                ),
-                opening_m=0.09,
-                payload_kg=3.0,  # assumed, as no such robot was built; arms of its size are rated for as much
-                park=MappingProxyType(dict(zip(_COURIER_JOINTS, (0.0, -1.9, 2.5, 0.0, 0.9, 0.0), strict=True))),
-            )
-        }
-    ),
+    arms={
+        Arms.RIGHT: ArmDescription(
+            joints=_COURIER_JOINTS,
+            base_link="column_link",
+            tool_frame="tool_frame",
+            gripper_joints={
+                GripperState.OPEN: dict.fromkeys(_COURIER_FINGERS, 0.045),
+                GripperState.CLOSE: dict.fromkeys(_COURIER_FINGERS, 0.0),
+            },
+            opening_m=0.09,
+            payload_kg=3.0,  # assumed, as no such robot was built; arms of its size are rated for as much
+            park=dict(zip(_COURIER_JOINTS, (0.0, -1.9, 2.5, 0.0, 0.9, 0.0), strict=True)),
+        )
+    },
     head_joints=("camera_pan_joint", "camera_tilt_joint"),
     camera_link="camera_optical_frame",
     camera_view_rad=FieldOfView(1.05, 0.80),

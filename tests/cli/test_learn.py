@@ -89,6 +89,30 @@ def test_a_policy_is_learned_from_one_kind_of_what_is_remembered(document: Any, 
     assert "belongs to --from-memory" in one_line_of(pycrorm("learn", "--where", "object=MILK", cwd=tmp_path))
 
 
+OWN_ROBOT = """from dataclasses import replace
+from pycrorm_async.world import COURIER
+from pycrorm_async.world.models import built_in_model
+SCOUT = replace(COURIER, name="scout", urdf=built_in_model("courier"))
+"""
+
+
+def test_a_robot_of_a_file_learns_and_the_memory_tells_it_from_others(
+    document: Any, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copy(folder / "pycrorm.db", tmp_path)
+    (tmp_path / "robots.py").write_text(OWN_ROBOT)
+    small = "--evaluate", "20", "--held-out", "20", "--min-samples-leaf", "5", "--policy", "scout.json"
+    learned = answer("learn", "--robot", "robots.py:SCOUT", "--rollouts", "150", *small, cwd=tmp_path)
+    assert learned["phases"][0]["successes"] == learned["phases"][0]["arms"]["RIGHT"]["successes"] > 0
+    assert learned["scene"] == document["scene"].replace("soft", "robot scout, soft")
+    assert load_policy(tmp_path / "scout.json").robot == "scout"
+    mixed = one_line_of(pycrorm("learn", "--from-memory", cwd=tmp_path))
+    assert "'pr2, simulated, soft limits'" in mixed
+    assert "'scout, simulated, soft limits'" in mixed
+    robots = ask(tmp_path / "pycrorm.db", "SELECT DISTINCT robot FROM pick_up_with_context ORDER BY robot")
+    assert robots == [("pr2",), ("scout",)]
+
+
 @pytest.mark.soak
 def test_a_study_is_printed_as_a_table(folder: Path) -> None:
     done = pycrorm(*BY_ONE, "--resume", "--study", "2", cwd=folder)
@@ -162,6 +186,8 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
         (("--explore", "random"), 2, "--explore random needs --model success"),
         (("--model", "polar", "--study", "5"), 2, "--study needs --model places, got --model polar"),
         (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
+        (("--robot", "lifter"), 2, "--robot lifter is not known: pr2, courier, tiago_pro or FILE.py:NAME"),
+        (("--robot", "none.py:LIFTER"), 2, "--robot none.py:LIFTER: the file 'none.py' does not exist"),
         (("--base-noise", "1", "0"), 2, "--base-noise needs --model polar or success"),
         (("--object-noise", "-1", "0"), 2, "object_m of a disturbance must be finite and >= 0, got -1.0"),
         (("--rollouts", "9", "--min-samples-leaf", "10"), 2, "choose a larger --rollouts (rollouts=) or a smaller"),

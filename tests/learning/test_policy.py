@@ -338,8 +338,8 @@ def test_no_cut_yields_another_policy(tmp_path: Path) -> None:
 
 def test_another_version_is_refused_by_its_number(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
-    path.write_text('{"format":"pycrorm policy","version":3,"crc32":0,"more":1}\n{"nodes":[]}\n')
-    with pytest.raises(PolicyFileRefused, match="has format version 3, but this program reads 1 to 2"):
+    path.write_text('{"format":"pycrorm policy","version":4,"crc32":0,"more":1}\n{"nodes":[]}\n')
+    with pytest.raises(PolicyFileRefused, match="has format version 4, but this program reads 1 to 3"):
         load_policy(path)
 
 

@@ -40,7 +40,10 @@ from pycrorm_async.learning import (
 )
 from pycrorm_async.learning.experiment import Experiment, Learned, read_rollouts, run
 from pycrorm_async.learning.features import FEATURES, SHOULDER_M, WRIST_M, features_of, features_of_frame, place_of
+from pycrorm_async.learning.polar_policy import PolarLeaf, PolarPolicy
+from pycrorm_async.learning.policy import Linear
 from pycrorm_async.learning.policy_cards import read_card
+from pycrorm_async.learning.policy_file import AnyPolicy
 from pycrorm_async.learning.pool import MemoryLocation
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scenes import Disturbance
@@ -325,8 +328,8 @@ def test_files_of_other_versions_and_damaged_ones_are_refused(tmp_path: Path) ->
     save_policy(NEAR_AND_LOW, path)
     content = path.read_bytes().splitlines()[1]
     assert load_policy(written(content)) == NEAR_AND_LOW
-    with pytest.raises(PolicyFileRefused, match="has format version 3, but this program reads 1 to 2"):
-        load_policy(written(content, version=3))
+    with pytest.raises(PolicyFileRefused, match="has format version 4, but this program reads 1 to 3"):
+        load_policy(written(content, version=4))
     newer = content.replace(b'"features_version":1', b'"features_version":3')
     with pytest.raises(PolicyFileRefused, match=r"grasp-polar, version 3, but this program has .*, versions 1 to 2"):
         load_policy(written(newer))
@@ -381,10 +384,25 @@ def test_a_robot_without_a_torso_has_ways_at_the_height_over_its_base() -> None:
         assert [each.torso for each in tries if isinstance(each, PredictedPickUpPerformable)] == [None] * 3
 
 
-def test_a_model_of_another_robot_is_refused(stage: Stage) -> None:
-    other = SuccessModel("grasp-polar", 1, 0.0, (), "courier", 100, 40)
-    with pytest.raises(CallerError, match="was fitted to pick-ups of courier, this robot is pr2: pass a model"):
-        ways_of(stage, other)
+@pytest.mark.parametrize("kind", ["model", "tree", "polar"])
+def test_a_policy_of_another_robot_is_refused_and_its_file_names_the_robot(
+    stage: Stage, tmp_path: Path, kind: str
+) -> None:
+    other: AnyPolicy = SuccessModel("grasp-polar", 1, 0.0, (), "courier", 100, 40)
+    if kind == "tree":
+        other = replace(default_policy(), robot="courier")
+    elif kind == "polar":
+        evenly = Linear((0.0, 1.0), (0.0, 1.0))
+        other = PolarPolicy("grasp-polar", 2, (PolarLeaf(1.0, (0.5, 0.5), evenly, evenly, evenly),), "courier")
+    save_policy(other, tmp_path / "policy.json")
+    read = load_policy(tmp_path / "policy.json")
+    assert read == other
+    assert name_of(read) == name_of(other)
+    message = "was learned from pick-ups of courier, this robot is pr2: pass a policy of this robot"
+    with pytest.raises(CallerError, match=message):
+        next(iter(MoveAndPickUp(stage.target, policy=read)))
+    with pytest.raises(CallerError, match=message):
+        MoveAndPickUp(stage.target, policy=read).drawn(np.random.default_rng(1))
 
 
 @pytest.mark.slow

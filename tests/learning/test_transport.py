@@ -152,7 +152,7 @@ async def test_a_model_of_another_robot_is_refused_where_no_way_is_possible() ->
     model = SuccessModel("grasp-polar", 1, 1.0, (), "courier", 100, 40)
     with tasks.kitchen(Disturbance()) as here:
         thing, _ = here.prepare(69, 4)
-        with pytest.raises(CallerError, match="was fitted to pick-ups of courier"):
+        with pytest.raises(CallerError, match="was learned from pick-ups of courier"):
             await anext(TransportPolicy(model).fetching(thing, ARMS, Pose((0, 0, 3))))
 
 
