@@ -38,7 +38,6 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.failures import (
     CapabilityAbsenceFailure,
     ManipulationGoalInCollision,
-    NavigationGoalInCollision,
     ReachabilityFailure,
 )
 from pycrorm_async.plan.motions import simulated_robot_within
@@ -337,19 +336,6 @@ async def test_past_and_learned_places_and_those_at_a_drawer_have_the_height_of_
         learned = next(MoveAndPickUp(milk).plain()).standing_position
         assert {each.position.z for each in (past.pose, drawer.pose, learned)} == {0.051}
         assert robot.root_pose(learned).position.z == pytest.approx(0.0, abs=1e-12)
-
-
-async def test_driving_into_an_object_with_what_the_base_carries_is_refused() -> None:
-    with BulletWorld(), simulated_robot_within(Limits.SOFT, collisions=True):
-        robot = robot_of(raised_robot())
-        cargo = Object("cargo", ObjectType.BREAKFAST_CEREAL, pose=Pose([0, 0, 2.0]))
-        robot.attach(cargo)
-        Object("lamp", ObjectType.BREAKFAST_CEREAL, pose=Pose([2, 0, 2.0]))
-        with pytest.raises(NavigationGoalInCollision, match="in lamp with cargo"):
-            await NavigateActionPerformable(Pose([2, 0, HEIGHT_M])).perform()
-        assert cargo.pose == Pose([0, 0, 2.0])
-        await NavigateActionPerformable(Pose([2, 1, HEIGHT_M])).perform()
-        assert cargo.pose.position == pytest.approx((2, 1, 2.0))
 
 
 # === tiago pro ================================================================================================

@@ -117,14 +117,20 @@ def fingers(scene: Scene, arm: Arms) -> set[float]:
 
 
 @ALL
-async def test_furniture_that_opens_and_closes_moves_with_the_hand_on_its_handle(
+async def test_furniture_that_opens_and_closes_moves_in_one_motion_with_the_hand_on_its_handle(
     scene: Scene, which: Furniture
 ) -> None:
     part = await which.base_placed_by(scene)
+    change_log = ChangeLog()
+    scene.world.observe(change_log)
     with collected_tree() as tree:
         await OpenActionPerformable(part, which.arm).perform()
     check(scene, which, which.goal)
     assert fingers(scene, which.arm) == {0.548}
+    arm, furniture, _ = change_log.notes[-3:]  # and the fingers that open
+    assert [each[:2] for each in (arm, furniture)] == [("joints", "pr2"), ("joints", "kitchen")]
+    assert furniture[2] == {f"{which.name}_joint": pytest.approx(which.goal)}
+    assert set(arm[2]) == set(scene.robot.robot_description.arms[which.arm].joints)  # type: ignore[union-attr]  # the pr2 has one
     with collected_tree() as closing:
         await CloseActionPerformable(part, which.arm).perform()
     check(scene, which, 0.0)
@@ -138,21 +144,6 @@ async def test_furniture_that_opens_and_closes_moves_with_the_hand_on_its_handle
             f"  {name}ingMotion",
             "  MoveGripperMotion",
         ]
-
-
-@ALL
-async def test_opening_is_one_motion_of_the_arm_and_one_of_the_furniture(scene: Scene, which: Furniture) -> None:
-    part = await which.base_placed_by(scene)
-    await GraspingActionPerformable(which.arm, part).perform()
-    check(scene, which, 0.0)
-    assert fingers(scene, which.arm) == {0.0}
-    change_log = ChangeLog()
-    scene.world.observe(change_log)
-    await OpeningMotion(part, which.arm).perform()
-    check(scene, which, which.goal)
-    assert change_log.names() == [("joints", "pr2"), ("joints", "kitchen")]
-    assert change_log.notes[1][2] == {f"{which.name}_joint": pytest.approx(which.goal)}
-    assert set(change_log.notes[0][2]) == set(scene.robot.robot_description.arms[which.arm].joints)  # type: ignore[union-attr]  # the pr2 has one
 
 
 async def test_the_approach_follows_the_direction_of_the_grasp(scene: Scene) -> None:
