@@ -17,7 +17,7 @@ import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Final
 
@@ -69,12 +69,9 @@ def is_whole(folder: Path, name: str) -> bool:
     """Return whether a recorder's folder holds this blob with the content of its name. Raises `OSError`."""
     try:
         with (folder / BLOBS / name).open("rb") as file:
-            digest = sha256()
-            while part := file.read(2**20):
-                digest.update(part)
+            return file_digest(file, "sha256").hexdigest() == name
     except FileNotFoundError:
         return False
-    return digest.hexdigest() == name
 
 
 def kept_with(segment: Path) -> Path:

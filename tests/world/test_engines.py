@@ -405,7 +405,7 @@ def test_a_root_link_named_world_and_links_without_a_mass_are_ordinary(world: Bu
 
 
 @pytest.mark.parametrize("engine", WITH_SHAPES)
-@pytest.mark.parametrize("name", ["cube.stl", "cube.obj", "cube.dae", "cube.glb", "cube.ply", "flat.obj"])
+@pytest.mark.parametrize("name", ["cube.stl", "text.stl", "cube.obj", "cube.dae", "cube.glb", "cube.ply", "flat.obj"])
 def test_a_mesh_of_every_format_is_the_hull_of_its_points(engine: str, name: str, tmp_path: Path) -> None:
     file = mesh_file(tmp_path / name)
     with BulletWorld(engine=engine) as world:
@@ -425,6 +425,8 @@ def mesh_file(path: Path) -> Path:
     trimesh = pytest.importorskip("trimesh")
     if path.stem == "flat":
         path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
+    elif path.stem == "text":
+        path.write_bytes(mesh_files.text_stl())
     elif path.suffix == ".dae":
         path.write_bytes(mesh_files.collada())
     else:

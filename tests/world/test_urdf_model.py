@@ -239,32 +239,6 @@ def meshed(file: str, kind: str = "collision") -> str:
     return SHAPE.format(kind=kind, shape=f'<geometry><mesh filename="{file}"/></geometry>')
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.stl", mesh_files.binary_stl()),
-        ("a.stl", mesh_files.text_stl()),
-        ("a.obj", mesh_files.obj()),
-        ("a.dae", mesh_files.collada()),
-        ("a.ply", None),
-        ("a.glb", None),
-    ],
-)
-def test_a_collision_mesh_of_every_format_has_its_box_and_meets_rays(
-    world: BulletWorld, name: str, content: bytes | None, tmp_path: Path
-) -> None:
-    file = tmp_path / name
-    if content is None:
-        import trimesh
-
-        trimesh.Trimesh(mesh_files.CORNERS, mesh_files.SIDES).export(file)
-    else:
-        file.write_bytes(content)
-    shelf = Object("shelf", ObjectType.ENVIRONMENT, meshed(str(file)))
-    np.testing.assert_allclose(shelf.box_in_link("base") or (), [(0, 0, 0), (1, 1, 1)], atol=1e-9)
-    assert world.ray_test([[0.5, 0.5, 2], [1.5, 0.5, 2]], [[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]]) == [shelf, None]
-
-
 def test_a_visual_mesh_that_is_missing_or_not_drawn_keeps_the_robot(
     world: BulletWorld, caplog: pytest.LogCaptureFixture
 ) -> None:
