@@ -15,13 +15,16 @@ arm and held object count, and the gripper opens 8.6 cm, that of a TIAGo Pro 7.9
 | TransportAction | as without experience: `CostmapLocation`, from the front, the torso as it is |
 | random | random ways, the first free ones |
 | random, checked | random ways, the first that kinematics and collisions allow |
+| recall, checked | the recalled ways that kinematics and collisions allow, then random ones |
 | model | the likeliest ways of a success model, nothing checked |
 | model, checked | the likeliest ways of a success model that kinematics and collisions allow |
 
-The model learns from pick-ups alone, in eight rounds of 750 at single tables (`Scene`), with the errors of the row.
-Errors: the base misses its place by 2 cm and 2°, the object is 0.5 cm and 3° beside its believed pose (standard
-deviations), 1 % slip. A try counts as failed if it was made and did not pick up; *all tries* also counts, of a task in
-which no try picked up, the tries that were left. Intervals are of 95 %.
+The model learns from pick-ups alone, in eight rounds of 750 at single tables (`Scene`), with the errors of all rows;
+what is recalled are 1,000 random pick-ups in the same scene. Errors: the base misses its place by 2 cm and 2°, the
+object is 0.5 cm and 3° beside its believed pose (standard deviations), 1 % slip.
+
+A try counts as failed if it was made and did not pick up; *all tries* also counts, of a task in which no try picked up,
+the tries that were left. Intervals are of 95 %. The seconds are of processor time for each task.
 
 A task can be *solved* if an arm and a grasp that fit the object pick it up from any place of a grid and place it from
 any, without errors: places 6 cm apart, five heights of the torso, and for placing nine headings, or if a row did it.
@@ -37,13 +40,15 @@ import json
 import math
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import AsyncExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
 from itertools import compress, product
 from multiprocessing import get_context
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -51,6 +56,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import NotEnoughExperience
 from pycrorm_async.learning import Disturbance, MoveAndPickUp, Scene, load_policy, save_policy
 from pycrorm_async.learning.move_and_pick_up import context_of
@@ -67,14 +73,16 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
 )
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
-from pycrorm_async.plan.geometry import retract
+from pycrorm_async.plan.geometry import pick_up_poses, retract
 from pycrorm_async.plan.locations import base_clearance, base_height_m, face, reaching_arms
 from pycrorm_async.plan.motions import ChosenRobot, SimulatedModules
 from pycrorm_async.plan.objects import designator_of, require_robot
-from pycrorm_async.plan.task import collected_tree
+from pycrorm_async.plan.task import collected_tree, experience
 from pycrorm_async.query.success import interval_95
+from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world.kinematics import within_reach
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
@@ -94,7 +102,9 @@ LEARNING = Scene(
     heights=(0.6, 1.25), turned=True, others=OBJECTS[1:], table=True, parked=True, collisions=True, torso_height=TORSO_M
 )
 ROUNDS, ROLLOUTS = 8, 750
-ROWS = ("TransportAction", "random", "random, checked", "model", "model, checked")
+REMEMBERED = 1_000
+"""The pick-ups that are recalled."""
+ROWS = ("TransportAction", "random", "random, checked", "recall, checked", "model", "model, checked")
 
 
 # --- learning -------------------------------------------------------------------------------------------------------
@@ -114,6 +124,19 @@ async def learned(scene: Scene, seed: int, *, rounds: int = ROUNDS, rollouts: in
             with suppress(NotEnoughExperience):  # a further round may succeed more often
                 model = SuccessModel.fit(pd.DataFrame(rows)).drawing(Draws.UNCERTAIN)
     return model.drawing(Draws.CONFIDENT)
+
+
+async def remember(url: str, scene: Scene, seed: int, count: int) -> None:
+    """Record random pick-ups in this scene."""
+    async with Memory.open(url) as memory:
+        with scene.entered() as stage:
+            async with memory.episode(description="pick-ups at a table"):
+                for index in range(count):
+                    stage.reset()
+                    action = MoveAndPickUp(stage.prepare(seed, index), policy=SuccessModel.untrained())
+                    with suppress(PlanFailure):
+                        await action.drawn(randomness(seed, index)).perform()
+        await memory.flush()
 
 
 async def tried(way: Any) -> dict[str, Any]:
@@ -181,12 +204,19 @@ def kitchen(errors: Disturbance, robot_name: str = PR2.name) -> Iterator[Kitchen
 
 @dataclass(frozen=True)
 class Ended:
-    """How a task ended: the tries that were made and did not pick up, whether the first one did, what was achieved."""
+    """How a task ended: the tries that were made and did not pick up, whether the first one did, what was achieved.
+
+    Attributes:
+        reasons: the class of the failure of each failed action, the innermost one of a try.
+        cpu_s: processor time.
+    """
 
     failed: int
     first: bool
     picked: bool
     placed: bool
+    reasons: list[str] = field(default_factory=list)
+    cpu_s: float = field(default=0.0, compare=False)
 
     @property
     def all_failed(self) -> int:
@@ -198,12 +228,14 @@ def transport(row: str, model: AnyPolicy | None, thing: Object, goal: Pose, rng:
     arms = [*require_robot().description.arms]
     if row == "TransportAction":
         return TransportAction(thing, (arms * TRIES)[:TRIES], [goal])
-    ways = TransportPolicy(model if row.startswith("model") else None, checked=row.endswith("checked"), rng=rng)
+    checked, recall = row.endswith("checked"), row.startswith("recall")
+    ways = TransportPolicy(model if row.startswith("model") else None, recall=recall, checked=checked, rng=rng)
     return TransportAction(thing, arms, [goal], policy=ways)
 
 
 async def performed(row: str, model: AnyPolicy | None, here: Kitchen, seed: int, number: int) -> Ended:
     thing, goal = here.prepare(seed, number)
+    began = process_time()
     plan = transport(row, model, thing, goal, np.random.default_rng((seed, number, 3)))
     placed = True
     with collected_tree() as tree:
@@ -211,13 +243,18 @@ async def performed(row: str, model: AnyPolicy | None, here: Kitchen, seed: int,
             await Retry(plan, max_tries=TRIES).perform()
         except PlanFailure:
             placed = False
+    reasons = [
+        type(each.failure).__name__
+        for each in tree
+        if isinstance(each.designator, TransportActionPerformable) and each.failure is not None
+    ]
     made = 0
     for node in tree:
         if isinstance(node.designator, TransportActionPerformable):
             made += 1
         elif isinstance(node.designator, PickUpActionPerformable) and node.status is TaskStatus.SUCCEEDED:
-            return Ended(made - 1, made == 1, True, placed)
-    return Ended(made, False, False, placed)
+            return Ended(made - 1, made == 1, True, placed, reasons, process_time() - began)
+    return Ended(made, False, False, placed, reasons, process_time() - began)
 
 
 def grid(at: Pose, turn: float) -> list[Pose]:
@@ -230,16 +267,27 @@ def grid(at: Pose, turn: float) -> list[Pose]:
     poses = [face(Pose((x + dx, y + dy, 0.0)), at, height_m=base_height_m(), turned=turn) for dx, dy in cells]
     clearance = base_clearance()
     assert clearance is not None
-    return [each for each in poses if clearance.refusal(each) is None]
+    return [*compress(poses, clearance.clear(poses))]
 
 
 def holds(thing: Object) -> Iterator[tuple[Arms, Grasp]]:
     """Yield each arm and grasp with which the object can be picked up from a place of the grid."""
     ways, around, heights = TransportPolicy(), grid(thing.pose, 0.0), torsos(thing)
-    for hold in product(require_robot().description.arms, Grasp):
-        tries = (MoveAndPickUpPerformable(each, designator_of(thing), *hold) for each in around)
-        if ways.takes(thing, *hold) and any(ways.reaches(each, torso) for each in tries for torso in heights):
-            yield hold
+    for arm, grasp in product(require_robot().description.arms, Grasp):
+        goals = pick_up_poses(thing.pose, grasp, Pose())[1:]
+        if ways.takes(thing, arm, grasp) and any(
+            ways.reaches(MoveAndPickUpPerformable(base, designator_of(thing), arm, grasp), torso)
+            for base, torso in reachable(arm, goals, around, heights)
+        ):
+            yield arm, grasp
+
+
+def reachable(
+    arm: Arms, goals: Sequence[Pose], bases: Sequence[Pose], heights: Sequence[float | None]
+) -> Iterator[tuple[Pose, float | None]]:
+    """Yield each place and height of the torso from which no goal is too far from the arm, or too near."""
+    reached = within_reach(require_robot().body, arm, goals, bases=bases, torso_heights=heights)
+    return compress(product(bases, heights), reached.ravel())
 
 
 def torsos(thing: Object) -> list[float | None]:
@@ -257,8 +305,7 @@ def solvable(here: Kitchen, seed: int, number: int) -> bool:
         goals = at, retract(at)
         return any(
             reaching_arms(robot, hold[0], base, lambda _: goals, torso_height=torso, grasps=False).refusal is None
-            for base in around[turn]
-            for torso in heights
+            for base, torso in reachable(hold[0], goals, around[turn], heights)
         )
 
     able: list[tuple[Arms, Grasp]] = []
@@ -273,17 +320,24 @@ def solvable(here: Kitchen, seed: int, number: int) -> bool:
 
 def job(
     row: str,
-    model_file: str | None,
+    experience_file: str | None,
     errors: Disturbance,
     seed: int,
     numbers: Sequence[int],
     robot_name: str = PR2.name,
 ) -> list[Any]:
-    """Return how these tasks ended, of the row "ceiling" whether they can be solved; run in a process of its own."""
+    """Return how these tasks ended, of the row "ceiling" whether they can be solved; run in a process of its own.
+
+    `experience_file` is that of the model, or the memory of the recalled ways.
+    """
 
     async def ended() -> list[Any]:
-        model = load_policy(model_file) if model_file is not None else None
-        with kitchen(errors, robot_name) as here:
+        model = load_policy(experience_file) if experience_file is not None and row.startswith("model") else None
+        async with AsyncExitStack() as stack:
+            if row.startswith("recall"):  # without recording, so that the order of the tasks does not matter
+                reading = await stack.enter_async_context(Reading.open(f"sqlite:///{experience_file}"))
+                experience.set(PickUpExperience.of(reading))
+            here = stack.enter_context(kitchen(errors, robot_name))
             if row == "ceiling":
                 return [solvable(here, seed, number) for number in numbers]
             return [await performed(row, model, here, seed, number) for number in numbers]
@@ -326,7 +380,7 @@ class Kept:
 def measure(
     kept: Kept,
     row: str,
-    model_file: str | None,
+    experience_file: str | None,
     errors: Disturbance,
     seed: int,
     numbers: Sequence[int],
@@ -334,11 +388,11 @@ def measure(
     robot_name: str,
 ) -> list[Any]:
     """Return how each of these tasks ended; the same for any number of workers."""
-    key = robot_name, row, str(errors), Path(model_file).name if model_file is not None else "", seed
+    key = robot_name, row, str(errors), Path(experience_file).name if experience_file is not None else "", seed
     missing = [number for number in numbers if kept.of(key, number) is None]
     with ProcessPoolExecutor(workers, mp_context=get_context("forkserver")) as pool:
         running = {
-            pool.submit(job, row, model_file, errors, seed, some, robot_name): some
+            pool.submit(job, row, experience_file, errors, seed, some, robot_name): some
             for some in (missing[first : first + BATCH] for first in range(0, len(missing), BATCH))
         }
         left = len(missing)
@@ -363,6 +417,8 @@ def figures_of(ended: Sequence[Ended], solvable: Sequence[bool]) -> dict[str, An
         "placed": share([each.placed for each in ended]),
         "failed_per_100": round(100 * sum(each.failed for each in ended) / len(ended), 1),
         "all_tries_per_100": round(100 * sum(each.all_failed for each in ended) / len(ended), 1),
+        "cpu_s": round(sum(each.cpu_s for each in ended) / len(ended), 2),
+        "reasons": dict(Counter(reason for each in ended for reason in each.reasons).most_common()),
     }
     if any(solvable):
         able = [each for each, flag in zip(ended, solvable, strict=True) if flag]
@@ -373,9 +429,9 @@ def figures_of(ended: Sequence[Ended], solvable: Sequence[bool]) -> dict[str, An
 
 def show(figures: dict[str, Any]) -> None:
     names = "first_try", "picked", "placed", "placed_of_solvable"
-    counts = "failed_per_100", "all_tries_per_100", "all_tries_per_100_solvable"
+    counts = "failed_per_100", "all_tries_per_100", "all_tries_per_100_solvable", "cpu_s"
     headings = "first try", "picked in 5", "placed", "placed of solvable"
-    table = Table("robot", "errors", "row", *headings, "failed tries per 100", "all tries", "all, per 100 solvable")
+    table = Table("robot", "errors", "row", *headings, "failed tries per 100", "all tries", "all, per 100 solvable", "s")
     for each in figures["rows"]:
         shares = ["{:.0%} ({:.0%}-{:.0%})".format(*each[name]) if name in each else "" for name in names]
         table.add_row(
@@ -398,19 +454,23 @@ def compared(
     with tempfile.TemporaryDirectory(prefix="tasks_") as temporary:
         folder = arguments.models or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
+        prefix = "" if robot_name == PR2.name else f"{robot_name}_"
+        files = {"model": folder / f"{prefix}tasks_{rollouts}.json", "recall": folder / f"{prefix}tasks.db"}
+        scene = replace(LEARNING, disturbance=ERRORS, robot=robot_name)
+        if any(row.startswith("model") for row in rows) and not files["model"].exists():
+            print(f"{robot_name}: learning from {ROUNDS * rollouts} pick-ups", file=sys.stderr, flush=True)
+            save_policy(asyncio.run(learned(scene, 1_000, rollouts=rollouts)), files["model"])
+        if any(row.startswith("recall") for row in rows) and not files["recall"].exists():
+            print(f"{robot_name}: remembering {REMEMBERED} pick-ups", file=sys.stderr, flush=True)
+            asyncio.run(remember(f"sqlite:///{files['recall']}", scene, 1_000, REMEMBERED))
         for name, errors in (("none", Disturbance()), ("all", ERRORS)):
-            if arguments.errors not in (None, name) or not rows:
+            if arguments.errors not in (None, name):
                 continue
-            file = folder / f"{'' if robot_name == PR2.name else robot_name + '_'}tasks_{name}_{rollouts}.json"
-            if any(row.startswith("model") for row in rows) and not file.exists():
-                learning = f"{robot_name}: learning from {ROUNDS * rollouts} pick-ups, errors: {name}"
-                print(learning, file=sys.stderr, flush=True)
-                scene = replace(LEARNING, disturbance=errors, robot=robot_name)
-                save_policy(asyncio.run(learned(scene, 1_000, rollouts=rollouts)), file)
             for row in rows:
-                used = str(file) if row.startswith("model") else None
+                used = files.get(row.removesuffix(", checked"))
+                file = None if used is None else str(used)
                 ends[name, row] = measure(
-                    kept, row, used, errors, arguments.seed, range(tasks), arguments.workers, robot_name
+                    kept, row, file, errors, arguments.seed, range(tasks), arguments.workers, robot_name
                 )
     able = kept.solved(robot_name, arguments.seed)
     rest = [number for number in range(tasks) if number not in able]
