@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager, suppress
 from contextvars import Context
@@ -338,7 +339,7 @@ async def run(
         held_out_seed = experiment.seed + HELD_OUT_SEED
         held_out = await runner.phase("default policy, held out", first, held_out_seed, experiment.held_out)
         coverage = coverage_of(held_out, policy)
-        limit = ceiling_of(experiment.scene, first, held_out_seed, experiment.held_out)
+        limit = ceiling_of(experiment.scene, first, held_out_seed, experiment.held_out, report_progress)
         ceiling = await asyncio.create_task(limit, context=Context())  # in which no memory of the caller records
         await runner.record_evaluation(policy, _evaluation(held_out, policy, coverage, ceiling))
         successes = tuple(choices_of(recorded_rollouts.successes(tries)))
@@ -422,22 +423,28 @@ def _evaluation(held_out: pd.DataFrame, policy: AnyPolicy, coverage: float | Non
     )
 
 
-async def ceiling_of(scene: Scene, policy: AnyPolicy, seed: int, count: int) -> float:
+async def ceiling_of(
+    scene: Scene, policy: AnyPolicy, seed: int, count: int, report_progress: ReportProgress = lambda *_: None
+) -> float:
     """Return the share of these scenes in which one of `CEILING_WAYS` ways of this policy succeeds.
 
     No choice among its ways succeeds more often, and errors of the robot, of which it makes none here, only make that
     rarer. The first `CEILING_SCENES` of a scene that varies are tried, and one of any other; nothing is recorded.
     """
-    solved, number = 0, min(count, CEILING_SCENES) if scene.varies else 1
+    solved, number = Tally(), min(count, CEILING_SCENES) if scene.varies else 1
     with replace(scene, disturbance=Disturbance()).entered() as stage:
         for index in range(number):
             target = stage.prepare(seed, index)
             action = MoveAndPickUp(target, policy=policy, rng=np.random.default_rng((seed, index, _CEILING)))
-            with suppress(PlanFailure):  # no place is free
+            try:
                 ways = map(action.way, action.rated(CEILING_WAYS)[0])
-                solved += await _any_succeeds(ways, stage, seed, index)
+                done = await _any_succeeds(ways, stage, seed, index)
+            except PlanFailure:  # no place is free
+                done = False
+            solved += Tally(1) if done else Tally(failures=Counter(unsolved=1))
+            report_progress("ceiling, each scene once", index + 1, number, solved)
             stage.reset()
-    return solved / number
+    return solved.success_rate
 
 
 async def _any_succeeds(ways: Iterable[MoveAndPickUpPerformable], stage: Stage, seed: int, index: int) -> bool:

@@ -459,7 +459,13 @@ async def test_interrupted_rounds_continue_to_the_model_of_rounds_without_an_int
     database_url: str, tmp_path: Path
 ) -> None:
     pytest.importorskip("sklearn")
-    whole = await run(replace(ROUNDS, workers=2), MemoryLocation(f"sqlite:///{tmp_path}/whole.db", tmp_path / "whole"))
+    steps: list[tuple[str, int, int, Tally]] = []
+    place = MemoryLocation(f"sqlite:///{tmp_path}/whole.db", tmp_path / "whole")
+    whole = await run(replace(ROUNDS, workers=2), place, lambda *step: steps.append(step))
+    *_, (name, done, total, solved) = steps
+    assert (name, done, total, solved.rollouts) == ("ceiling, each scene once", 60, 60, 60)
+    assert solved.success_rate == whole.ceiling
+    assert [each[1] for each in steps if each[0] == name] == [*range(1, 61)]
     assert isinstance(whole.policy, SuccessModel)
     assert (whole.policy.rollouts, whole.policy.successes) == (300, len(whole.successes))
     assert whole.policy.robot == "pr2"  # so that another robot refuses the model
