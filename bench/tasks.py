@@ -430,8 +430,8 @@ def figures_of(ended: Sequence[Ended], solvable: Sequence[bool]) -> dict[str, An
 def show(figures: dict[str, Any]) -> None:
     names = "first_try", "picked", "placed", "placed_of_solvable"
     counts = "failed_per_100", "all_tries_per_100", "all_tries_per_100_solvable", "cpu_s"
-    headings = "first try", "picked in 5", "placed", "placed of solvable"
-    table = Table("robot", "errors", "row", *headings, "failed tries per 100", "all tries", "all, per 100 solvable", "s")
+    headings = "first try", "picked in 5", "placed", "of solvable"
+    table = Table("robot", "errors", "row", *headings, "failed per 100", "all tries", "all, per 100 solvable", "s")
     for each in figures["rows"]:
         shares = ["{:.0%} ({:.0%}-{:.0%})".format(*each[name]) if name in each else "" for name in names]
         table.add_row(

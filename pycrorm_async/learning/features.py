@@ -35,7 +35,7 @@ All functions are pure: they know no world. `move_and_pick_up.context_of` reads 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -67,6 +67,8 @@ FEATURES: Final = (
 PLACE: Final = ("robot_in_object_x", "robot_in_object_y")
 FORMER_PLACE: Final = ("object_x", "object_y")
 """Former names of the columns in `PLACE`."""
+NEAR_SURFACE_M: Final = 0.03
+"""The greatest distance in m between the underside of an object and the surface that it stands on."""
 CIRCUMSTANCES: Final = ("width", "depth", "origin_height", "edge_distance", "edge_angle")
 """Optional columns of a frame: features that a way to pick up records, and the angle of the edge's outward normal in
 the object's frame, rad."""
@@ -82,6 +84,13 @@ class Edge(NamedTuple):
 
     distance: float
     angle: float
+
+
+def edges_around(x: float, y: float, low: Sequence[float], high: Sequence[float], turned: float) -> Iterator[Edge]:
+    """Yield the edges of a rectangle around a point of its axes, which are turned by `turned` rad from the object's."""
+    for axis, (at, angle) in enumerate(((x, 0.0), (y, math.pi / 2))):
+        yield Edge(high[axis] - at, turned + angle)
+        yield Edge(at - low[axis], turned + angle + math.pi)
 
 
 @dataclass(frozen=True)

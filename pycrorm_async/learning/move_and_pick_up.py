@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Select, func, select
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition
-from pycrorm_async.learning.features import Edge, PickUpContext
+from pycrorm_async.learning.features import NEAR_SURFACE_M, Edge, PickUpContext, edges_around
 from pycrorm_async.learning.polar_policy import PolarPolicy
 from pycrorm_async.learning.policy import (
     ARMS,
@@ -125,9 +125,6 @@ def _runs(cells: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
 #
 # Read the circumstances of a pick-up from the world: heights, the object's box, and the surface below it.
 
-_NEAR_SURFACE_M = 0.03
-"""The greatest distance in m between the underside of an object and the surface that it stands on."""
-
 
 def context_of(target: Object, *, at: Pose | None = None) -> PickUpContext:
     """Return the circumstances of picking this object up with the acting robot, here or `at` a pose. Moves nothing.
@@ -151,7 +148,7 @@ def context_of(target: Object, *, at: Pose | None = None) -> PickUpContext:
 def _edges_below(robot: objects.CurrentRobot, target: Object, pose: Pose, origin_height: float) -> Iterator[Edge]:
     """Yield the edges of the surface that the object stands on at this pose, in its frame; none in the air."""
     x, y, z = pose.position
-    below = (x, y, z - origin_height - _NEAR_SURFACE_M)
+    below = (x, y, z - origin_height - NEAR_SURFACE_M)
     [support] = target.world.ray_test([(x, y, z)], [below], ignore=[target, *robot.with_load()])
     if support is None:
         return
@@ -164,14 +161,11 @@ def _edges_below(robot: objects.CurrentRobot, target: Object, pose: Pose, origin
         at = point.relative_to(frame).position
         if all(low <= here <= high for low, here, high in zip(box.min[:2], at[:2], box.max[:2], strict=True)):
             top = frame.position.z + box.max.z - below[2]
-            if 0 <= top <= 2 * _NEAR_SURFACE_M:
+            if 0 <= top <= 2 * NEAR_SURFACE_M:
                 tops.append((top, frame, at, box))
     if tops:
         _, frame, at, box = max(tops, key=lambda each: each[0])
-        turned = frame.yaw - pose.yaw
-        for axis, angle in ((0, 0.0), (1, math.pi / 2)):
-            yield Edge(box.max[axis] - at[axis], turned + angle)
-            yield Edge(at[axis] - box.min[axis], turned + angle + math.pi)
+        yield from edges_around(*at[:2], box.min, box.max, frame.yaw - pose.yaw)
 
 
 # === move and pick up =========================================================================================

@@ -24,11 +24,12 @@ ones.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -38,8 +39,9 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, NotEnoughExperience
+from pycrorm_async.events.types import LinkBoxValue
 from pycrorm_async.learning.experiment import Learned, choices_of, rated
-from pycrorm_async.learning.features import PickUpContext
+from pycrorm_async.learning.features import NEAR_SURFACE_M, Edge, PickUpContext, edges_around
 from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import Evaluation, HeldOut, record_policy
@@ -51,6 +53,7 @@ from pycrorm_async.projections.derived_views import parameters_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
 from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.pose import ObjectType, Pose
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,6 +63,8 @@ FOLDS: Final = 5
 """The parts into which the groups are divided, at most; each costs a fit."""
 COLUMNS: Final = "robot object arm grasp policy description scene kind".split()
 """The columns that `select_tries` takes."""
+_POSE: Final = "x y z qx qy qz qw frame".split()
+_PLACE: Final = [f"place_{each}" for each in _POSE]
 _OWN_WORLD: Final = "BulletWorld ("
 """The begin of the description of a world of this package."""
 
@@ -88,8 +93,8 @@ async def read_tries(reading: Reading) -> pd.DataFrame:
 
     The columns are those of `MoveAndPickUp.query_with_failures` and `features.CIRCUMSTANCES`, and id, uuid (of the
     episode), object, policy, description, scene (of the rollouts, else the world in one line), seed (of the rollouts),
-    kind and place_from: `choice` (recorded with its circumstances), `goal` or `stood`. Raises `MissingExtra` without
-    pandas.
+    kind, place_from: `choice` (recorded with its circumstances), `goal` or `stood`, and furniture: whether the surface
+    below the object is known, if there is one. Raises `MissingExtra` without pandas.
     """
     import pandas as pd
 
@@ -97,6 +102,7 @@ async def read_tries(reading: Reading) -> pd.DataFrame:
     frame = pd.concat(each.assign(place_from=place) for each, place in zip(frames, ("goal", "stood"), strict=True))
     frame = _with_choices(frame.sort_values("id").reset_index(drop=True))
     await _add_sizes(reading, frame)
+    frame = (await _with_edges(reading, frame)).drop(columns=["episode", *_PLACE])
     rollouts, world = frame["rollouts"], frame["world"].fillna("")
     simulated = rollouts.notna() | world.str.startswith(_OWN_WORLD)
     frame["kind"] = [
@@ -140,12 +146,15 @@ def _where_the_robot_stood() -> Select[Any]:
 def _tries(action: Any, node: Any, stand: Any, *columns: Any) -> Select[Any]:
     """Select the nodes of an action that succeeded or failed, with the pose of the object, and columns of `stand`."""
     taken, added, place = aliased(orm.Object), aliased(orm.Object), aliased(orm.Pose)
-    poses = [each.label(f"{name}_{each.key}") for name, pose in (("stand", stand), ("place", place)) for each in (
-        pose.x, pose.y, pose.z, pose.qx, pose.qy, pose.qz, pose.qw, pose.frame
-    )]  # fmt: skip
+    poses = [
+        getattr(pose, each).label(f"{name}_{each}")
+        for name, pose in (("stand", stand), ("place", place))
+        for each in _POSE
+    ]
     return (
         select(
-            node.id, orm.ProcessMetaData.uuid, action.arm, action.grasp, node.status, node.robot, node.torso_height,
+            node.id, _episode(node).label("episode"), orm.ProcessMetaData.uuid,
+            action.arm, action.grasp, node.status, node.robot, node.torso_height,
             taken.obj_type.label("object"), orm.ProcessMetaData.description, orm.ProcessMetaData.world,
             added.description_fingerprint.label("model"), *poses, *columns,
         )
@@ -173,8 +182,7 @@ def _with_choices(frame: pd.DataFrame) -> pd.DataFrame:
         height=-dz - frame["torso_height"].astype(float).fillna(0.0),
         parameters=frame["parameters"].fillna("{}"),
     )[frame["stand_frame"] == frame["place_frame"]]
-    poses = [name for name in frame.columns if name.startswith(("stand_", "place_q", "place_x", "place_y", "place_z"))]
-    return with_parameters(placed.drop(columns=[*poses, "place_frame"]))
+    return with_parameters(placed.drop(columns=[name for name in frame.columns if name.startswith("stand_")]))
 
 
 async def _add_sizes(reading: Reading, frame: pd.DataFrame) -> None:
@@ -194,12 +202,71 @@ async def _add_sizes(reading: Reading, frame: pd.DataFrame) -> None:
                 frame.loc[rows, name] = values
 
 
+async def _with_edges(reading: Reading, frame: pd.DataFrame) -> pd.DataFrame:
+    """Add the edge of the surface below the object where a try did not record it, from the furniture as it was then."""
+    piece, added, chosen = aliased(orm.Object), aliased(orm.Object), frame["place_from"] == "choice"
+    columns = [getattr(orm.Pose, each) for each in _POSE]
+    question = (
+        select(_episode(piece), piece.identity_id, piece.id, added.description_fingerprint, *columns)
+        .join(orm.Pose, and_(orm.Pose.id == piece.pose_id, _episode(orm.Pose) == _episode(piece)))
+        .join(added, and_(added.id == piece.identity_id, _episode(added) == _episode(piece)))
+        .where(piece.obj_type == ObjectType.ENVIRONMENT)
+        .order_by(piece.id)
+    )
+    episodes: dict[int, dict[int, list[tuple[int, str, Pose]]]] = {}
+    async with reading.session() as session:
+        for episode, identity, number, model, *pose in await session.execute(question):
+            episodes.setdefault(episode, {}).setdefault(identity, []).append((number, model, _pose(*pose)))
+        models = {model for pieces in episodes.values() for [(_, model, _), *_] in pieces.values()}
+        described = orm.ObjectDescription.fingerprint.in_(models)
+        descriptions = (await session.scalars(select(orm.ObjectDescription).where(described))).all()
+    boxes = {each.fingerprint: each.declared.link_boxes for each in descriptions}
+    frame = frame.assign(furniture=chosen | frame["episode"].isin(episodes))
+    tries = frame[frame["furniture"] & ~chosen & frame["origin_height"].notna()]
+    edges: list[tuple[float, float]] = []
+    rows = tries[["episode", "id", "origin_height", *_PLACE]].itertuples(index=False, name=None)
+    for choice, (episode, node, origin_height, *pose) in zip(choices_of(tries), rows, strict=True):
+        place, around = _pose(*pose), tuple[Edge, ...]()
+        for history in episodes[episode].values():
+            before = bisect_left(history, node, key=itemgetter(0))  # where it was when the try began
+            if before and not around:
+                _, model, at = history[before - 1]
+                around = _edges_below(place, origin_height, at, boxes.get(model, ()))
+        known = PickUpContext(math.nan, edges=around).circumstances([choice])
+        edges.append((known["edge_distance"].item(), known["edge_angle"].item()))
+    frame.loc[tries.index, ["edge_distance", "edge_angle"]] = np.array(edges).reshape(-1, 2)
+    return frame
+
+
+def _pose(x: float, y: float, z: float, qx: float, qy: float, qz: float, qw: float, frame: str) -> Pose:
+    return Pose((x, y, z), (qx, qy, qz, qw), frame)
+
+
+def _edges_below(place: Pose, origin_height: float, piece: Pose, boxes: Sequence[LinkBoxValue]) -> tuple[Edge, ...]:
+    """Return the edges of the highest of these boxes that an object at this place stands on, in its frame."""
+    x, y, z = place.relative_to(piece).position
+    if place.frame != piece.frame:
+        return ()
+    below = [
+        box
+        for box in boxes
+        if abs(x - box.center[0]) <= box.half[0]
+        and abs(y - box.center[1]) <= box.half[1]
+        and abs(z - origin_height - box.center[2] - box.half[2]) <= NEAR_SURFACE_M
+    ]
+    if not below:
+        return ()
+    top = max(below, key=lambda box: box.center[2] + box.half[2])
+    low, high = (np.array(top.center) + sign * np.array(top.half) for sign in (-1, 1))
+    return tuple(edges_around(x, y, low.tolist(), high.tolist(), piece.yaw - place.yaw))
+
+
 def _unknown(tries: pd.DataFrame) -> tuple[str, ...]:
     """Return what the memory does not know of these tries, each as a line with the number of tries."""
     counts = {
         "the place to which the robot was sent: learned from where it stood": tries["place_from"] == "stood",
         "the size of the object": tries["width"].isna(),
-        "the surface below the object": tries["place_from"] != "choice",
+        "the surface below the object": ~tries["furniture"],
         "joint limits, collisions and disturbance": tries["rollouts"].isna(),
     }
     return tuple(f"{what} ({count:,} of {len(tries):,})" for what, each in counts.items() if (count := int(each.sum())))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -17,7 +18,8 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning import MoveAndPickUp, Policy, Scene, SuccessModel, batch_rollout, name_of
 from pycrorm_async.learning.experiment import Learned
-from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable
+from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable, context_of
+from pycrorm_async.learning.policy import PickUpChoice
 from pycrorm_async.learning.policy_cards import read_card
 from pycrorm_async.learning.recorded_policy import HeldOut, read_policy
 from pycrorm_async.learning.remembered import (
@@ -166,6 +168,34 @@ async def test_tries_have_the_place_to_which_the_robot_was_sent_also_if_it_never
     assert (stood.object_x.item(), stood.object_y.item()) == pytest.approx((-0.7, -0.3))
     assert isinstance(chosen, PredictedPickUpPerformable)
     assert (choice.object_x.item(), choice.torso_height.item()) == (chosen.relative_x, chosen.torso)
+
+
+@pytest.mark.slow
+async def test_the_edge_of_the_table_is_known_of_tries_that_no_model_chose() -> None:
+    scene, count = Scene(heights=(0.7, 1.0), turned=True, table=True, parked=True, collisions=True), 12
+    async with Memory.open("sqlite://") as memory:
+        with scene.entered() as stage:
+            tries = MoveAndPickUp(stage.target)
+            await batch_rollout(tries, count, seed=1, scene=str(scene), reset=stage.reset, prepare=stage.prepare)
+            known = []
+            for index in range(count):
+                stage.reset()
+                context = context_of(stage.prepare(1, index))
+                drawn = tries.drawn(randomness(1, index))
+                at = drawn.standing_position.relative_to(stage.target.pose).position
+                known.append(context.circumstances([PickUpChoice(drawn.arm, drawn.grasp, *at[:2])]))
+        async with memory.episode(description="in the air"):
+            with Scene().entered() as stage, suppress(PlanFailure):
+                await MoveAndPickUp(stage.target).drawn(randomness(1, 0)).perform()
+        await memory.flush()
+        frame = await read_tries(memory.reading)
+    assert frame.furniture.tolist() == [True] * count + [False]
+    assert frame.edge_distance.isna().tolist() == [False] * count + [True]
+    for name in ("edge_distance", "edge_angle"):
+        expected = [each[name].item() for each in known]
+        off = np.remainder(frame[name][:count] - expected + math.pi, math.tau) - math.pi
+        assert np.abs(off).max() < 1e-6, name
+    assert len(set(frame.edge_distance[:count].round(6))) == count
 
 
 def test_experience_of_one_kind_agrees_in_limits_collisions_furniture_and_disturbance() -> None:
