@@ -248,13 +248,3 @@ async def test_a_closed_memory_is_no_longer_queried(tmp_path: Path) -> None:
         await task
     with pytest.raises(CallerError, match="queried from a memory"):
         await resolved_location()
-
-
-async def test_the_location_with_the_better_success_rate_comes_first(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
-        async with memory.episode(description="trying"):
-            await pick_up(Pose([0.65, 1.0, 0]))
-            for _ in range(2):
-                await pick_up(Pose([0.5, 0.8, 0]))
-        await memory.flush()
-        assert place_of(await resolved_location()) == pytest.approx((0.5, 0.8))

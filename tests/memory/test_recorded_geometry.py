@@ -223,14 +223,6 @@ async def test_a_link_with_only_a_visual_mesh_is_seen_again_as_its_box_and_textu
     assert '<box size="0.1 0.2 0.3"' in hull
 
 
-async def test_a_visual_mesh_without_a_box_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Object, "visual_boxes", lambda *_: {})
-    (tmp_path / "wedge.obj").write_text(wedge(3))
-    robot = HULL.format(folder=tmp_path, mesh="wedge.obj").replace("<texture", "<!-- texture").replace('png"/>', "-->")
-    _, missing = await recorded(f"sqlite:///{tmp_path / 'm.db'}", robot, Settings())
-    assert (missing.total, missing.last) == (1, "DescriptionDeclared.boxes: the meshes of these links have none: hull")
-
-
 DIES = """
 import asyncio, os, signal, sys
 from pycrorm_async import Memory

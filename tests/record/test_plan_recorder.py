@@ -323,18 +323,6 @@ async def test_a_description_is_put_again_when_many_others_were_put_since() -> N
     assert len(texts) == rest + 1
 
 
-async def test_a_fault_is_counted_and_the_object_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(_: str) -> tuple[str, ...]:
-        raise RuntimeError("no parser\x00")
-
-    monkeypatch.setattr("pycrorm_async.world.model_boxes.mesh_files", broken)
-    with recorder_case() as case, case.episode(), BulletWorld():
-        Object("box", ObjectType.GENERIC_OBJECT, box(0))
-    assert [(each.name, each.description) for each in added(case)] == [("box", None)]
-    assert case.emitter.faults.total == 0
-    assert case.emitter.missing.count == (1, "ObjectAdded.description: no parser\\x00")
-
-
 @pytest.mark.parametrize("full", [False, True])
 async def test_a_mesh_becomes_a_blob_unless_the_spool_is_full(tmp_path: Path, full: bool) -> None:
     mesh = tmp_path / "wedge.OBJ"
