@@ -40,8 +40,6 @@ class ListSink:
         self.broken_starts = 0
         self.space = asyncio.Event()
         self.lock = threading.RLock()
-        self.fails_at: int | None = None
-        """The sequence whose put raises, once."""
         self.before_end: Callable[[], None] = lambda: None
         """Called before the end of each node is put."""
 
@@ -56,13 +54,6 @@ class ListSink:
     ) -> int:
         if heading.type == "NodeEnded":
             self.before_end()
-        with self.lock:
-            if heading.episode is not None and self.sequences.get(heading.episode, 0) + 1 == self.fails_at:
-                self.fails_at = None
-                raise RuntimeError("the disk is on fire")
-            return self._put(heading, payload, reserved)
-
-    def _put(self, heading: Heading, payload: bytes, reserved: bool) -> int:
         if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:
             self.broken_starts -= 1
             raise RuntimeError("the disk is on fire")
@@ -70,11 +61,12 @@ class ListSink:
             raise RuntimeError("the disk is on fire")
         if self.full and not reserved:
             raise SpoolFull("full")
-        sequence = 0
-        if heading.episode is not None:
-            sequence = self.sequences[heading.episode] = self.sequences.get(heading.episode, 0) + 1
-        self.records.append((heading.episode, sequence, decode(heading.type, payload)))
-        return sequence
+        with self.lock:
+            sequence = 0
+            if heading.episode is not None:
+                sequence = self.sequences[heading.episode] = self.sequences.get(heading.episode, 0) + 1
+            self.records.append((heading.episode, sequence, decode(heading.type, payload)))
+            return sequence
 
     def put_blob(self, content: bytes) -> str:
         if self.full:

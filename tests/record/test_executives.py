@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory, Settings
-from pycrorm_async.memory import SyncMemory
 from pycrorm_async.record import executives as module
 from pycrorm_async.record.declarations import FieldSpec
 from pycrorm_async.record.executives import Activations, BehaviourReader, NodeType, Runs, ValueChanges
@@ -24,7 +23,7 @@ from pycrorm_async.record.values import json_text, plain_value
 from pycrorm_async.testing.contracts import check_executive
 from pycrorm_async.world.pose import Pose
 from tests.databases import ask
-from tests.record.recordings import assert_verified, nodes, url_of
+from tests.record.recordings import assert_verified, nodes, opened, url_of
 
 # === activations ==============================================================================================
 #
@@ -378,10 +377,6 @@ class Model:
         if not self.fields:
             raise OSError("no fields")
         return self.fields
-
-
-def opened(folder: Path) -> SyncMemory:
-    return Memory.sync(url_of(folder), settings=Settings(fold="at_end"))
 
 
 async def test_a_made_up_engine_passes_the_test_of_an_integration(tmp_path: Path) -> None:
