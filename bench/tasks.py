@@ -273,8 +273,9 @@ def grid(at: Pose, turn: float) -> list[Pose]:
 def holds(thing: Object) -> Iterator[tuple[Arms, Grasp]]:
     """Yield each arm and grasp with which the object can be picked up from a place of the grid."""
     ways, around, heights = TransportPolicy(), grid(thing.pose, 0.0), torsos(thing)
-    for arm, grasp in product(require_robot().description.arms, Grasp):
-        goals = pick_up_poses(thing.pose, grasp, Pose())[1:]
+    description = require_robot().description
+    for arm, grasp in product(description.arms, Grasp):
+        goals = pick_up_poses(description, thing.pose, grasp, Pose())[1:]  # the first depends on the base
         if ways.takes(thing, arm, grasp) and any(
             ways.reaches(MoveAndPickUpPerformable(base, designator_of(thing), arm, grasp), torso)
             for base, torso in reachable(arm, goals, around, heights)
