@@ -276,10 +276,7 @@ def test_a_live_queue_writes_the_documented_bytes(tmp_path: Path) -> None:
 #
 # A segment's header is read whole or not at all, and a segment file has all its blocks before its first use.
 
-GOLDEN_DIGITS = dict(
-    line.split(" ") for line in (Path(__file__).parent.parent / "golden" / "queue_v1.hex").read_text().splitlines()
-)
-SEGMENT = bytes.fromhex(GOLDEN_DIGITS["segment"])
+SEGMENT = GOLDEN["segment"]
 HEADER_RECORDER = bytes(range(0x20, 0x30))
 HEADER = SegmentHeader(
     recorder=HEADER_RECORDER,
