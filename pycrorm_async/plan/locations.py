@@ -32,6 +32,7 @@ from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.motions import chosen_limits, clear_posture, collisions_count
 from pycrorm_async.plan.task import current_node
 from pycrorm_async.world import queries
+from pycrorm_async.world.arms import STARTS_OF_SEARCH
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object, current_world
 from pycrorm_async.world.kinematics import Unreachable, headings, postures
@@ -249,7 +250,15 @@ def reaching_arms(
     refusals: list[str] = []
     for candidate in _each(robot, arm):
         answers = [
-            postures(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
+            postures(
+                robot.body,
+                candidate,
+                each,
+                base=base_pose,
+                torso_height=torso_height,
+                limits=limits,
+                starts=STARTS_OF_SEARCH,
+            )
             for each in goals(candidate)
         ]
         try:

@@ -100,17 +100,19 @@ def postures(
     base: Pose | None = None,
     torso_height: float | None = None,
     limits: Limits = Limits.SOFT,
+    starts: int = arm_ik.STARTS_MAX,
 ) -> Iterator[dict[str, float]]:
     """Yield what `solve` returns, then further postures for the target, with which an arm may be clear of obstacles.
 
-    An arm with a closed form has one: that farthest from all limits. Raises what `solve` raises, before the first.
+    An arm with a closed form has one: that farthest from all limits. With fewer `starts` other arms are refused sooner,
+    and may be refused a target that they reach. Raises what `solve` raises, before the first.
     """
     description = robot.robot_description
     if description is None:
         raise CallerError(f"{robot.name!r} has no robot description, so its arms are unknown")
     root = robot.root_pose(base)
     if not isinstance(description, PR2Description):
-        yield from _chain_postures(robot, description, arm, target, root, torso_height, limits)
+        yield from _chain_postures(robot, description, arm, target, root, torso_height, limits, starts)
         return
     height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
     narrower = robot.joint_limits if limits is Limits.HARD else None
@@ -154,6 +156,7 @@ def _chain_postures(
     root: Pose,
     torso_height: float | None,
     limits: Limits,
+    starts: int,
 ) -> Iterator[dict[str, float]]:
     """Yield the postures of a robot without a closed form, whose root link is at `root`."""
     arm_description = _one_arm(description.arms, description, arm)
@@ -168,7 +171,7 @@ def _chain_postures(
     if distance > reach_m:
         raise Unreachable(target, arm, f"too far: {distance:.3f} m from its first joint, it reaches {reach_m:.3f} m")
     is_reached = False
-    for joints in chain.postures(goal, positions, _chain_bounds(chain, arm_description, limits)):
+    for joints in chain.postures(goal, positions, _chain_bounds(chain, arm_description, limits), starts):
         reached = chain.forward(positions | joints)
         turned = _angle_between(reached.orientation, goal.orientation) if chain.held is Held.ALL else 0.0
         if reached.distance(goal) <= EXACT_M and turned <= EXACT_RAD:

@@ -9,9 +9,13 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
+from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.orm import PickUpWithContextView
+from pycrorm_async.orm import TransportAction as TransportRow
 from pycrorm_async.plan import (
     AccessingLocation,
     ActionAbstract,
@@ -43,6 +47,7 @@ from pycrorm_async.plan.failures import (
 from pycrorm_async.plan.motions import simulated_robot_within
 from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.plan.task import PastSuccess
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import (
     COURIER,
     PR2,
@@ -358,8 +363,25 @@ def tables() -> Iterator[Object]:
         yield robot
 
 
-async def test_a_tiago_pro_fetches_an_object_from_one_table_and_places_it_on_another(tables: Object) -> None:
+async def test_a_tiago_pro_fetches_an_object_from_one_table_and_places_it_on_another(
+    tables: Object, tmp_path: Path
+) -> None:
     milk, goal = tables.world.object("milk"), Pose([-1.45, 0.2, 0.838], yaw_quaternion(2.0))
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        async with memory.episode(description="a second robot"):
+            await _transport(tables, milk, goal)
+        await memory.flush()
+        async with memory.session() as session:
+            [row] = (await session.scalars(select(TransportRow))).all()
+            view = PickUpWithContextView
+            [picked] = (await session.execute(select(view.robot, view.status, view.obj_type))).all()
+    assert (row.robot, row.status, row.target_location.x) == ("tiago_pro", TaskStatus.SUCCEEDED, -1.45)
+    assert tuple(picked) == ("tiago_pro", TaskStatus.SUCCEEDED, ObjectType.MILK)
+    assert milk.pose.distance(goal) < 1e-5
+    assert milk.attached_to is None
+
+
+async def _transport(tables: Object, milk: Object, goal: Pose) -> None:
     await ParkArmsActionPerformable(Arms.BOTH).perform()
     await MoveTorsoActionPerformable(0.25).perform()
     place = CostmapLocation(milk, reachable_for=tables).resolve()
@@ -367,8 +389,6 @@ async def test_a_tiago_pro_fetches_an_object_from_one_table_and_places_it_on_ano
     await LookAtActionPerformable(milk.pose).perform()
     assert (await DetectActionPerformable(milk).perform()).name == "milk"
     await TransportActionPerformable(milk, place.reachable_arms[0], goal).perform()
-    assert milk.pose.distance(goal) < 1e-5
-    assert milk.attached_to is None
 
 
 async def test_a_hand_that_is_parked_up_approaches_along_the_fingers_of_the_grasp(tables: Object) -> None:
