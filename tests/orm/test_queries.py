@@ -10,7 +10,6 @@ from sqlalchemy import select
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
-from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import (
     CandidateValue,
@@ -165,16 +164,6 @@ async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) ->
     assert state.pose.process_metadata is drive.process_metadata
 
 
-async def test_the_text_of_an_action_has_its_fields_and_its_robot(breakfast: EventLog) -> None:
-    (pick,) = await every(breakfast, select(PickUpAction))
-    assert repr(pick) == (
-        f"PickUpAction(id={row(11)}, process_metadata_id=1, dtype='PickUpAction', kind='action',"
-        f" robot_state_id={row(11)}, object_id={row(4)}, arm=<Arms.LEFT: 1>, grasp=<Grasp.TOP: 3>,"
-        f" robot_state=RobotState(id={row(11)}, process_metadata_id=1, torso_height=0.25,"
-        f" type=<ObjectType.ROBOT: 8>, pose_id={row(11, 1)}))"
-    )
-
-
 async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog) -> None:
     actions = await every(breakfast, select(Action).order_by(Action.id))
     assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
@@ -228,25 +217,6 @@ async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
     assert (node.children[0].id, node.children[0].action.dtype) == (drive, "NavigateAction")
     moved = await every(breakfast, select(Object).options(selectinload(Object.node)).order_by(Object.id))
     assert [each.node and each.node.id for each in moved if each.name == "milk"] == [None, row(11)]
-
-
-@pytest.mark.parametrize(
-    ("class_", "sequence", "name"),
-    [(TaskTreeNode, 2, "children"), (TaskTreeNode, 8, "ancestors"), (Object, 12, "node")],
-)
-async def test_an_attribute_that_is_not_loaded_names_the_remedy(
-    breakfast: EventLog, class_: type[Base], sequence: int, name: str
-) -> None:
-    message = rf"^{name} of {class_.__name__} \(\d+,\) is not loaded: .*awaitable_attrs.{name}`"
-    async with session_on(breakfast) as session:
-        loaded = await session.get_one(class_, row(sequence))
-        with pytest.raises(CallerError, match=message):
-            getattr(loaded, name)
-        assert await getattr(loaded.awaitable_attrs, name)  # the session is still usable
-        getattr(loaded, name)
-    (closed,) = await every(breakfast, select(class_).where(class_.id == row(sequence)))  # type: ignore[attr-defined]
-    with pytest.raises(CallerError, match=message):
-        getattr(closed, name)
 
 
 async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakfast: EventLog) -> None:

@@ -8,7 +8,6 @@ import sys
 import weakref
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,11 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
-from pycrorm_async.plan.objects import BelieveObject
 from pycrorm_async.projections.columns import Layout, unite
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world import Grasp, ObjectType, Pose
 from pycrorm_async.world.pose import Arms
 from tests.commands import environment
 from tests.memory.note_actions import NoteActionPerformable, url_of
@@ -322,28 +318,6 @@ def test_a_class_that_is_deleted_before_any_query_affects_none() -> None:
 # User types in a memory: subclasses, mapped classes, views, data frames, and processes that lack the class.
 
 
-@dataclass
-class GentlePickUpActionPerformable(PickUpActionPerformable):
-    force: float = 1.0
-
-    async def perform(self) -> None:
-        """Lift nothing: the test is about the recorded row."""
-
-
-async def test_a_subclass_of_an_action_is_listed_among_that_action(tmp_path: Path) -> None:
-    cup = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.0, 2.0, 3.0]))
-    async with Memory.open(url_of(tmp_path)) as memory:
-        await GentlePickUpActionPerformable(cup, Arms.RIGHT, Grasp.TOP, 0.5).perform()
-        await memory.flush()
-        async with memory.session() as session:
-            picked = (await session.scalars(select(PickUpAction))).one()
-            assert type(picked).__name__ == "GentlePickUpAction"
-            assert (picked.arm, picked.grasp, picked.force) == (Arms.RIGHT, Grasp.TOP, 0.5)  # type: ignore[attr-defined]
-            assert picked.object.dtype == "BelieveObject"
-            assert picked.object.pose is not None
-            assert (picked.object.name, picked.object.pose.position.z) == ("cup", 3.0)
-
-
 async def test_a_memory_that_only_records_generates_no_class(tmp_path: Path) -> None:
     identities = Designator.__mapper__.polymorphic_map
     before = set(identities)
@@ -367,30 +341,3 @@ async def test_a_plain_engine_sees_an_unknown_type_as_an_action_with_its_paramet
         assert (note.dtype, note.parameters) == ("NoteAction", {"text": "seen"})
         assert (await session.scalars(select(Designator))).one() is note
     await engine.dispose()
-
-
-@dataclass
-class CountActionPerformable(ActionAbstract):
-    big: int | None
-    small: float | None
-    sure: bool | None
-
-    async def perform(self) -> None:
-        """Succeed without doing anything."""
-
-
-async def test_a_frame_keeps_integers_and_truth_values_where_others_are_missing(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        async with memory.episode(description="e"):
-            await CountActionPerformable(2**53 + 1, 0.1, True).perform()
-            await CountActionPerformable(None, None, None).perform()
-        await memory.flush()
-        counted = memory.mapped(CountActionPerformable)
-        question = select(counted.big, counted.small, counted.sure).order_by(counted.id)
-        frame = await memory.dataframe(question)
-        assert [str(dtype) for dtype in frame.dtypes] == ["Int64", "float64", "boolean"]
-        assert frame.big[0] == 2**53 + 1
-        assert (frame.small[0], frame.sure[0]) == (0.1, True)
-        assert frame.isna().sum().to_list() == [1, 1, 1]
-        whole = await memory.dataframe(question.where(counted.big.is_not(None)))
-        assert [str(dtype) for dtype in whole.dtypes] == ["int64", "float64", "bool"]

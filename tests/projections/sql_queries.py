@@ -15,6 +15,15 @@ async def ask(log: EventLog, question: str, *parameters: Any) -> list[tuple[Any,
         return [tuple(row) for row in await connection.exec_driver_sql(question, parameters)]
 
 
+async def lose_event(log: EventLog, number: int, sequence: int) -> None:
+    """Delete an event of the log, as if the file had lost it."""
+    is_server = log.engine.dialect.name == "postgresql"
+    async with log.engine.begin() as connection:
+        trigger = "event_is_not_changed ON event" if is_server else "event_is_not_deleted"
+        await connection.exec_driver_sql(f"DROP TRIGGER IF EXISTS {trigger}")
+        await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = {number} AND sequence = {sequence}")
+
+
 async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Projector:
     """Return a projector that has folded all of these scripts."""
     projector = Projector(log)

@@ -55,7 +55,7 @@ from tests.projections.event_script import (
     pose,
     row,
 )
-from tests.projections.sql_queries import ask, names
+from tests.projections.sql_queries import ask, lose_event, names
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 
@@ -250,11 +250,7 @@ async def test_the_reason_why_a_process_stops_folding_it_remains_until_the_proje
     projector = await folded(log, [*declarations(PICK_UP), *tries(1).records], GraspRate())
     records = tries(2).records
     await log.append(records)
-    async with log.engine.begin() as connection:
-        is_server = connection.dialect.name == "postgresql"
-        trigger = "event_is_not_changed ON event" if is_server else "event_is_not_deleted"
-        await connection.exec_driver_sql(f"DROP TRIGGER {trigger}")
-        await connection.exec_driver_sql("DELETE FROM event WHERE episode = 2 AND sequence = 4")
+    await lose_event(log, 2, 4)
     await projector.catch_up()
     (state,) = await states(log, [GraspRate()])
     assert state.fault is not None

@@ -385,6 +385,14 @@ def test_one_by_one_in_any_order_makes_the_tables_of_all_at_once(seed: int) -> N
             ),
         ),
         (
+            (TEXT, replace(TWIN, table="Note_Action")),
+            {"note_action": {"text": "text"}, "note_action_action": {"text": "real"}},
+            (
+                "Note_Action needs the table Note_Action, but note_action exists already (set another dtype);"
+                " the action is kept as Note_ActionAction"
+            ),
+        ),
+        (
             (TEXT, REMARK),
             {"note_action": {"text": "text"}, "remark_action": {"text_boolean": "boolean"}},
             "RemarkAction.text is declared as text and as boolean; the boolean is kept as text_boolean",
@@ -398,7 +406,7 @@ def test_one_by_one_in_any_order_makes_the_tables_of_all_at_once(seed: int) -> N
             ),
         ),
     ],
-    ids=["case", "no name is free", "kind", "table", "alias", "alias of a type with rows"],
+    ids=["case", "no name is free", "kind", "table", "case of a table", "alias", "alias of a type with rows"],
 )
 def test_the_later_declaration_gets_other_names(
     types: tuple[DesignatorTypeDeclared, ...], leaves: dict[str, dict[str, str]], line: str

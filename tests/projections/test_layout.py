@@ -16,14 +16,12 @@ from pycrorm_async.orm import PickUpAction, TaskTreeNode
 from pycrorm_async.projections import projector
 from pycrorm_async.projections.columns import Layout, LayoutConflict, LeafTable
 from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.projections.verify import verify
 from pycrorm_async.projections.views import public_views
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.log import EventLog
 from tests.databases import ask
 from tests.golden.definitions import FILE, changed
 from tests.projections.event_script import PICK_UP, SAYING, append_and_fold, declared, field
 from tests.projections.rebuild_cases import TYPES, picking, traces
+from tests.projections.verify_cases import assert_clean, verified
 from tests.table_comparison import differences, tables_of
 
 # === layout ===================================================================================================
@@ -36,45 +34,6 @@ def layout_of(*types: DesignatorTypeDeclared) -> Layout:
     for each in types:
         layout = layout.with_declaration(each)
     return layout
-
-
-def test_lists_and_dicts_have_no_column() -> None:
-    joints = declared("MoveJointsMotion", "move_joints_motion", field("names", "list", 2, item="text"), kind="motion")
-    assert layout_of(joints).leaves == {"move_joints_motion": {}}
-
-
-@pytest.mark.parametrize(
-    ("second", "reason"),
-    [
-        (
-            declared("SayingAction", "saying_action", field("text", "integer", 2)),
-            (
-                "SayingAction.text is declared as text and as integer (types that share a name must agree:"
-                " rename one field or set another dtype)"
-            ),
-        ),
-        (
-            declared("SayingAction", "saying_action", field("Text", "text", 2)),
-            "SayingAction is declared with the column text and with Text: rename one",
-        ),
-        (declared("SayingAction", "saying_action", kind="motion"), "SayingAction is declared as action and as motion"),
-        (
-            declared("PoseAction", "pose", field("x", "real", 2)),
-            "PoseAction: its table would be 'pose', which the memory itself uses (set another dtype)",
-        ),
-        (
-            declared("Saying", "Saying_Action", field("text", "text", 2)),
-            "Saying needs the table Saying_Action, but saying_action exists already (set another dtype)",
-        ),
-    ],
-    ids=["another type", "another case", "another kind", "a table of ours", "a table in another case"],
-)
-def test_a_declaration_that_contradicts_a_table_is_refused_with_both_named(
-    second: DesignatorTypeDeclared, reason: str
-) -> None:
-    with pytest.raises(LayoutConflict) as raised:
-        layout_of(SAYING, second)
-    assert str(raised.value) == reason
 
 
 def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the_type() -> None:
@@ -181,14 +140,6 @@ def test_a_changed_table_or_view_is_noticed_and_a_changed_table_raises_the_versi
 # The tables behind the views come last in a list of names, and tables with former names are used until a rebuild.
 
 
-async def assert_verified(url: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
-    result = await verify(log)
-    await log.close()
-    assert (result.damage, result.differences) == (0, [])
-    assert result.episodes > 0
-
-
 @pytest.mark.slow
 async def test_the_tables_of_a_generation_come_last_in_a_list_of_names(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
@@ -215,10 +166,10 @@ async def test_tables_with_former_names_are_used_until_a_rebuild_replaces_them(
     assert ask(database_url, f"SELECT count(*) FROM {at}pose__7")[0][0] > 0
     async with Reading.open(database_url) as reading, reading.session() as session:
         assert len((await session.scalars(select(PickUpAction.id))).all()) == 10
-    await assert_verified(database_url)
+    assert_clean(await verified(database_url))
     before = tables_of(database_url)
     assert (await rebuild_memory(database_url)).generation == 1001
     assert differences(before, tables_of(database_url)) == []
     assert traces(database_url) == []
     assert ask(database_url, f"SELECT count(*) FROM {at}zz_pose__1001")[0][0] > 0
-    await assert_verified(database_url)
+    assert_clean(await verified(database_url))

@@ -18,13 +18,12 @@ from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectDescription
 from pycrorm_async.plan import NavigateAction, simulated_robot
-from pycrorm_async.projections.findings import VerifyResult
-from pycrorm_async.projections.verify import verify
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from tests.databases import ask, ask_to_change, change_each, run_in_own_loop
+from tests.databases import ask, ask_to_change, run_in_own_loop
+from tests.projections.verify_cases import unlock, verified
 from tests.table_comparison import declarations_of, differences, tables_of
 
 RED = (1.0, 0.0, 0.0, 0.5)
@@ -68,14 +67,6 @@ async def record(url: str, mesh: Path) -> None:
         await memory.flush()
         assert (memory.status.faults.total, memory.status.missing.total) == (0, 0)
     mesh.unlink()
-
-
-async def verified(url: str) -> VerifyResult:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
-    try:
-        return await verify(log)
-    finally:
-        await log.close()
 
 
 async def test_every_row_of_an_object_leads_to_its_description(described: str) -> None:
@@ -152,12 +143,7 @@ async def test_a_copy_and_a_rebuild_have_the_same_descriptions(described: str, t
 @pytest.mark.slow
 async def test_verify_names_a_description_that_changed_or_is_gone_and_its_blob(filled: str) -> None:
     [(name,)] = ask(filled, f"SELECT fingerprint {DESCRIBED} AND payload LIKE '%wedge.obj%'")
-    if filled.startswith("postgresql:"):
-        ask_to_change(filled, "ALTER TABLE pycrorm.pycrorm_declaration DISABLE TRIGGER ALL")
-        ask_to_change(filled, "ALTER TABLE pycrorm.pycrorm_blob DISABLE TRIGGER ALL")
-    else:
-        triggers = ask(filled, "SELECT name FROM sqlite_master WHERE type = 'trigger'")
-        change_each(filled, [f"DROP TRIGGER {trigger}" for (trigger,) in triggers])
+    unlock(filled)
     blob = "pycrorm.pycrorm_blob" if filled.startswith("postgresql:") else "pycrorm_blob"
     ask_to_change(filled, f"DELETE FROM {blob}")
     (damage,) = (await verified(filled)).damages

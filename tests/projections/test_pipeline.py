@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Sequence
 import pytest
 
 from pycrorm_async.events.codec import Record, encode
-from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -23,7 +22,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, mixed, name_of, row
-from tests.projections.sql_queries import ask
+from tests.projections.sql_queries import ask, lose_event
 
 pytestmark = pytest.mark.slow
 
@@ -220,10 +219,11 @@ async def test_an_episode_stops_where_it_cannot_be_folded_whichever_worker_meets
         case "refused by the database":
             payload = encode(LocationResolved("CostmapLocation", considered=2**64 - 1))
             first.records[place - 1] = first.records[place - 1]._replace(type="LocationResolved", payload=payload)
-        case _:
-            await _forget_when_stored(log, place)
-    records = [*declarations(SAYING), *first.records, *talk(2, words=4).records]
-    await folded_by_two(log, other_log, records, WorkerInLoop, batch_events=2)
+    hands = await workers_of([log, other_log], WorkerInLoop, 2)
+    await log.append([*declarations(SAYING), *first.records, *talk(2, words=4).records])
+    if bad == "missing":
+        await lose_event(log, 1, place)
+    await fold_all(log, hands, 2)
     rows = await ask(log, "SELECT number, folded, parked IS NULL FROM episode ORDER BY number")
     assert [tuple(map(int, each)) for each in rows] == [(1, place - 1, 0), (2, 12, 1)]
     ((reason,),) = await ask(log, "SELECT parked FROM episode WHERE number = 1")
@@ -275,22 +275,3 @@ async def test_several_pipelines_fold_every_event_once(log: EventLog, other_log:
     counts = await asyncio.gather(*(fold_all(log, each, 3) for each in pairs))
     assert await stored_words(log) == [word for number in range(1, 6) for word in words_of(number, 10)]
     assert sum(counts) == sum(len(each.records) for each in talks)
-
-
-async def _forget_when_stored(log: EventLog, place: int) -> None:
-    """Delete event `place` of the first episode as soon as it is stored, as if the file had lost it."""
-    is_server = log.engine.dialect.name == "postgresql"
-    async with log.engine.begin() as connection:
-        if is_server:
-            await connection.exec_driver_sql("DROP TRIGGER event_is_not_changed ON event")
-        else:
-            await connection.exec_driver_sql("DROP TRIGGER event_is_not_deleted")
-    append = log.append
-
-    async def appended(records: Sequence[Record]) -> dict[EpisodeId, str]:
-        refusals = await append(records)
-        async with log.engine.begin() as connection:
-            await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = 1 AND sequence = {place}")
-        return refusals
-
-    log.append = appended  # type: ignore[method-assign]

@@ -43,7 +43,7 @@ from tests.projections.event_script import (
     row,
     time_us,
 )
-from tests.projections.sql_queries import all_rows, ask, names, stored_and_folded
+from tests.projections.sql_queries import all_rows, ask, lose_event, names, stored_and_folded
 
 pytestmark = pytest.mark.slow
 
@@ -272,11 +272,7 @@ async def test_a_missing_event_parks_its_episode_and_the_others_continue(log: Ev
     projector = Projector(log)
     await projector.open()
     await log.append([*rich_episode(1).records[:3], *rich_episode(2).records[:3]])
-    async with log.engine.begin() as connection:
-        postgresql = log.engine.dialect.name == "postgresql"
-        trigger, place = ("event_is_not_changed", " ON event") if postgresql else ("event_is_not_deleted", "")
-        await connection.exec_driver_sql(f"DROP TRIGGER {trigger}{place}")
-        await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = 1 AND sequence = {missing}")
+    await lose_event(log, 1, missing)
     assert await projector.catch_up() == 3 + missing - 1
     rows = [(row.number, row.folded, row.parked) for row in await log.episodes()]
     assert rows == [(1, missing - 1, f"event {missing} is missing in the log"), (2, 3, None)]

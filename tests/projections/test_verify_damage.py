@@ -16,7 +16,7 @@ from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_each, ask_to_change, change_each
+from tests.databases import ask, ask_each, ask_to_change
 from tests.projections.event_script import NAVIGATE, PICK_UP, name_of
 from tests.projections.verify_cases import (
     PreparedMemory,
@@ -29,13 +29,13 @@ from tests.projections.verify_cases import (
     rows_of,
     rows_of_each,
     set_columns,
+    unlock,
+    verified,
     visible_tables,
 )
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
-
-TRIGGERS = "SELECT name FROM sqlite_master WHERE type = 'trigger'"
 
 
 async def fill(url: str, rounds_of_second: int = 1) -> None:
@@ -58,14 +58,6 @@ async def log(database_url: str, prepared: PreparedMemory) -> AsyncIterator[Even
     reader = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
     yield reader
     await reader.close()
-
-
-def unlock(url: str) -> None:
-    if url.startswith("postgresql:"):
-        tables = ("event", "episode", "pycrorm_declaration", "pycrorm_digest")
-        change_each(url, [f"ALTER TABLE pycrorm.{table} DISABLE TRIGGER ALL" for table in tables])
-    else:
-        change_each(url, [f"DROP TRIGGER {name}" for (name,) in ask(url, TRIGGERS)])
 
 
 def everything(url: str) -> list[Any]:
@@ -232,29 +224,21 @@ async def file(tmp_path: Path) -> Path:
     return tmp_path / "memory.db"
 
 
-async def verified(file: Path) -> VerifyResult:
-    reader = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{file}"), create=False)
-    try:
-        return await verify(reader)
-    finally:
-        await reader.close()
-
-
 async def test_invalid_text_is_damage(file: Path) -> None:
     payload = b'{"source":"camera","object_type":"\xff"}'.hex()
     ask_to_change(file, f"UPDATE event SET payload = CAST(x'{payload}' AS TEXT) {OF_2} 9")
-    result = await verified(file)
+    result = await verified(f"sqlite:///{file}")
     (line,) = map(str, result.damages)
     assert line.startswith(f"episode 2, event 9: {CANNOT} ObjectDetected cannot be decoded: 'utf-8' codec")
     ask_to_change(file, f"UPDATE event SET type = CAST(x'ff' AS TEXT) {OF_2} 7")
-    result = await verified(file)
+    result = await verified(f"sqlite:///{file}")
     (line,) = map(str, result.damages)
     assert line.startswith("episode 2, event 7: cannot be read: ")
     assert result.episodes == 3
 
 
 async def test_an_overwritten_page_of_the_log_is_reported_by_episode_and_event(file: Path) -> None:
-    assert_clean(await verified(file))
+    assert_clean(await verified(f"sqlite:///{file}"))
     [(payload,)] = ask(file, "SELECT payload FROM event WHERE episode = 2 AND sequence = 250")
     # Located by a text that occurs nowhere else.
     ask_to_change(file, "UPDATE event SET payload = replace(payload, 'x', 'x') WHERE episode = 2 AND sequence = 250")
@@ -264,7 +248,7 @@ async def test_an_overwritten_page_of_the_log_is_reported_by_episode_and_event(f
     page = places[len(places) // 2] // 4096
     image[page * 4096 : (page + 1) * 4096] = b"\xee" * 4096
     file.write_bytes(image)
-    result = await verified(file)
+    result = await verified(f"sqlite:///{file}")
     (unreadable,) = [each for each in result.damages if each.number is not None]
     assert unreadable.number == 2
     assert unreadable.sequence is not None
@@ -294,7 +278,7 @@ async def test_flipped_bytes_anywhere_cause_findings_or_an_error_and_never_a_tra
         copy = tmp_path / "copy.db"
         copy.write_bytes(image)
         try:
-            result = await verified(copy)
+            result = await verified(f"sqlite:///{copy}")
             findings_for_any_parts += bool(result.damage or result.drift)
         except PycrormError:
             findings_for_any_parts += 1

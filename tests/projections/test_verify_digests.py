@@ -21,8 +21,7 @@ from tests.backups import Backup
 from tests.commands import COMMAND, answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change, run_in_own_loop
 from tests.projections.event_script import pose
-from tests.projections.test_verify_damage import unlock
-from tests.projections.verify_cases import fold_in_batches, full, in_parts, opened, rebuilt
+from tests.projections.verify_cases import fold_in_batches, full, in_parts, opened, rebuilt, unlock
 from tests.store.factories import declaration
 
 pytestmark = pytest.mark.slow

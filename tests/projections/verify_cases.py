@@ -44,7 +44,7 @@ from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_each, ask_to_change
+from tests.databases import ask, ask_each, ask_to_change, change_each
 from tests.projections.event_script import NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
 
 EVERY = declared(
@@ -147,6 +147,23 @@ async def look(log: EventLog, *, episode: int | None = None) -> VerifyResult:
     """Verify everything, or one episode."""
     rows = {each.number: each for each in await log.episodes()}
     return await verify(log, episode=None if episode is None else rows[episode])
+
+
+async def verified(url: str) -> VerifyResult:
+    """Verify the memory at this URL, which is not written to."""
+    async with await EventLog.open(DatabaseAddress.parse(url), create=False) as log:
+        return await verify(log)
+
+
+def unlock(url: str) -> None:
+    """Let the log of a memory be changed."""
+    if url.startswith("postgresql:"):
+        blobs = [name for (name,) in ask(url, "SELECT relname FROM pg_class WHERE relname = 'pycrorm_blob'")]
+        tables = ("event", "episode", "pycrorm_declaration", "pycrorm_digest", *blobs)
+        change_each(url, [f"ALTER TABLE pycrorm.{table} DISABLE TRIGGER ALL" for table in tables])
+    else:
+        triggers = ask(url, "SELECT name FROM sqlite_master WHERE type = 'trigger'")
+        change_each(url, [f"DROP TRIGGER {name}" for (name,) in triggers])
 
 
 def findings(result: VerifyResult) -> tuple[Any, ...]:

@@ -20,7 +20,7 @@ from pycrorm_async import Memory
 from tests.commands import environment
 from tests.databases import Server
 from tests.integrations.pycram.environment import make_environment
-from tests.projections.test_verify_damage import unlock
+from tests.projections.verify_cases import unlock
 
 # === pages ====================================================================================================
 #
