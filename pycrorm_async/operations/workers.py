@@ -163,9 +163,9 @@ class FoldWorker:
         self._change(batches=self.state.batches + (count > 0))
         return count
 
-    async def fold_rest(self, share: Share, *, now: bool) -> bool:
+    async def fold_rest(self, share: Share) -> bool:
         """Refresh materialised views and fold custom projections by one step; return False if none was behind."""
-        return bool(await self._request(FoldRest(share, now)))
+        return bool(await self._request(FoldRest(share)))
 
     async def fold_share(self, share: Share) -> int | None:
         """Fold a batch of this share of a rebuild; return the number of its events, None when none is left."""
@@ -291,7 +291,6 @@ class FoldRest(NamedTuple):
     """Bring views, and projections of this share, up to date; answered with whether there was anything to do."""
 
     share: Share
-    now: bool
 
 
 class FoldShare(NamedTuple):
@@ -351,8 +350,8 @@ class _RequestHandler:
                 return await (await self._opened(self._log)).runner.prepare(spans)
             case Write():
                 return await (await self._opened(self._log)).runner.write()
-            case FoldRest(share, now):
-                return await (await self._opened(self._log)).fold_rest(now=now, share=share)
+            case FoldRest(share):
+                return await (await self._opened(self._log)).fold_rest(share)
             case FoldShare(share):
                 if self._rebuild is None:
                     self._rebuild = await Rebuild.join(self._log, share)
@@ -618,7 +617,6 @@ class FoldWorkerTables(TablesPort):
         self._workers = workers
         self._target = LiveTarget(destination.log)
         self._runner = FoldRunner(self._target)
-        self._has_news = True
         self._rest_until_s = 0.0
 
     @property
@@ -649,10 +647,9 @@ class FoldWorkerTables(TablesPort):
             count = await self._runner.fold_next(workers)
             if share.many > 1 and 0 < (count or 0) < LOOKAHEAD_EVENTS_MIN:
                 self._rest_until_s = now_s() + min(now_s() - began_s, _REST_S_MAX)
-            self._has_news = count is not None or await workers[0].fold_rest(share, now=self._has_news)
+            return count is not None or await workers[0].fold_rest(share)
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
-        return self._has_news
 
     async def behind(self) -> Mapping[str, int]:
         return await self._destination.behind()

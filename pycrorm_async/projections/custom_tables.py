@@ -39,13 +39,13 @@ from pycrorm_async.store.stored import EpisodeRow
 
 _log = logging.getLogger("pycrorm_async.projections")
 _CHECK_S = 1.0
-"""The interval between checks for events from other processes."""
+"""The least interval between two checks of all episodes for events that no batch of the tables has folded."""
 _COMPARED_MAX = 1_000
 """Bounds the episodes that are compared to find a share that no process folds."""
-_SCAN_SHARE_MAX = 0.02
-"""Bounds the share of time in which all episodes are checked, and not the newest only: 100,000 take 25 ms."""
-_SCAN_S_MAX = 10.0
-"""Bounds the time until all episodes are checked again, also after a check that a busy machine made slow."""
+_CHECK_SHARE_MAX = 0.02
+"""Bounds the share of time in which they are checked: 100,000 take 25 ms."""
+_CHECK_S_MAX = 10.0
+"""Bounds the time until they are checked again, also after a check that a busy machine made slow."""
 
 
 def learner_of(projection: Projection) -> checkpoints.Learn:
@@ -160,9 +160,9 @@ class _CustomFold(NamedTuple):
     runner: checkpoints.FoldRunner
     others: OtherShares
 
-    async def share(self, own: checkpoints.Share, *, may_compare: bool) -> checkpoints.Share:
+    async def share(self, own: checkpoints.Share) -> checkpoints.Share:
         """Return the share to fold: the own one, or all of them while one of the others is not folded."""
-        if own == checkpoints.WHOLE or not (may_compare and self.others.is_due):
+        if own == checkpoints.WHOLE or not self.others.is_due:
             return self.others.folded_with(own)
         self.target.share = checkpoints.WHOLE
         async with self.target.log.reading() as connection:
@@ -180,7 +180,7 @@ class CustomTables:
         self._installed = installed
         self._batch_events = batch_events
         self._folds: list[_CustomFold] = []
-        self._checked_s = self._packed_s = self._scan_due_s = 0.0
+        self._due_s = 0.0
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
         """Create missing tables; return whether the views must be created again.
@@ -214,47 +214,36 @@ class CustomTables:
         return [each.runner for each in self._folds if packed or not each.projection.is_packed]
 
     async def fold_next_batch(
-        self, *, now: bool, until_visible: bool = False, share: checkpoints.Share = checkpoints.WHOLE
+        self, *, until_visible: bool = False, share: checkpoints.Share = checkpoints.WHOLE
     ) -> bool:
         """Fold a batch of this share of each projection; return False if none was behind.
 
         Shares that no process folds are folded too, because the process of another share may not have the code.
 
-        Checks only every `_CHECK_S` unless `now` is True, and then the newest episodes only, because older ones rarely
-        get events; all of them in some of the checks, and if `until_visible` is True. The package's own projections are
-        folded every `_CHECK_S` unless `until_visible` is True, because a batch of a few events costs as much as one of
-        a thousand.
+        Unless `until_visible` is True, checks at intervals only: the batches of the tables leave few events, those of
+        the package's own projections, of which a few cost as much as a thousand.
         """
         loop = asyncio.get_running_loop()
         time_s = loop.time()
-        if not self._folds or (not now and time_s < self._checked_s + _CHECK_S):
+        if not self._folds or not (until_visible or time_s >= self._due_s):
             return False
-        is_scan = until_visible or time_s >= self._scan_due_s
-        packed = is_scan or time_s >= self._packed_s + _CHECK_S
         count = most_events = 0
-        for fold in [each for each in self._folds if packed or not each.projection.is_packed]:
+        for fold in [*self._folds]:
             projection, target, runner, _ = fold
-            if is_scan and target.newest_only:
-                runner.last_number = 0  # begin with the oldest, which have waited
-            target.newest_only = not is_scan
             try:
-                target.share = await fold.share(share, may_compare=is_scan)
+                target.share = await fold.share(share)
                 events = await runner.fold_next()
                 count += events is not None
                 most_events = max(most_events, events or 0)
-                if projection.is_packed and (events is None or events < checkpoints.LOOKAHEAD_EVENTS_MIN):
-                    self._packed_s = time_s
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:
                 _log.warning("this process stops folding the projection %s: %s", projection.name, fault)
                 await self._note_fault(fold, str(fault))
                 self._folds.remove(fold)
-        if is_scan and most_events < min(checkpoints.LOOKAHEAD_EVENTS_MIN, self._batch_events):
-            pause_s = 0 if count else (loop.time() - time_s) / _SCAN_SHARE_MAX
-            self._scan_due_s = time_s + min(max(pause_s, _CHECK_S), _SCAN_S_MAX)
-        if not count:
-            self._checked_s = time_s
+        if most_events < min(checkpoints.LOOKAHEAD_EVENTS_MIN, self._batch_events):
+            pause_s = 0 if count else (loop.time() - time_s) / _CHECK_SHARE_MAX
+            self._due_s = time_s + min(max(pause_s, _CHECK_S), _CHECK_S_MAX)
         return count > 0
 
     async def _note_fault(self, fold: _CustomFold, reason: str) -> None:

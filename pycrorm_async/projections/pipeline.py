@@ -601,7 +601,7 @@ def _table(place: str) -> TableClause:
 # episodes there are. Every other generation, one that a rebuild fills or that of a custom projection, has a table with
 # one row for each episode (section "checkpoints"), which is dropped together with it. A rebuild copies its checkpoints
 # into `episode.folded` when it switches. No index leads from it to the episodes that are behind, so a custom projection
-# checks the newest episodes often and all of them seldom (`custom`).
+# checks all episodes at intervals (`custom_tables`).
 #
 # `SideTarget` reads the generation under its key in every transaction. For a rebuild another number is an error. For a
 # projection it means that another process has rebuilt it: a batch folded for the old tables is folded again for the new
@@ -612,9 +612,6 @@ _log = logging.getLogger("pycrorm_async.projections")
 
 _BEHIND_EPISODES_MAX = 400
 """Bounds the episodes in one batch, because reading each of them costs as much as folding some of its events."""
-_NEWEST_EPISODES = 1_000
-"""The episodes that a check of the newest reads, in 0.3 ms: more than record at a time."""
-_NEWEST = text("SELECT coalesce(max(number), 0) FROM episode")
 
 
 class Share(NamedTuple):
@@ -700,7 +697,6 @@ class SideTarget:
         number: of the generation; None accepts any that has the key.
 
     Attributes:
-        newest_only: whether `behind` leaves out all but the newest episodes.
         share: the episodes that this process folds.
     """
 
@@ -715,7 +711,6 @@ class SideTarget:
         share: Share = WHOLE,
     ) -> None:
         self.log = log
-        self.newest_only = False
         self._key = key
         self._projection = projection
         self._version = version
@@ -726,9 +721,6 @@ class SideTarget:
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
         await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
-        if self.newest_only:
-            newest = (await connection.execute(_NEWEST)).scalar_one()
-            after = max(after, newest - _NEWEST_EPISODES)
         return await episodes_behind(
             connection,
             self._place,

@@ -54,7 +54,6 @@ class Projector:
         self._log = log
         self._views = views
         self._custom = CustomTables(log, projections, installed, batch_events=batch_events)
-        self._has_news = True
         self._target = LiveTarget(log)
         self._batch_events = batch_events
         self._until_visible = False
@@ -106,16 +105,13 @@ class Projector:
                 self._until_visible = False
             while await self._refresh():
                 pass
-            while await self._custom.fold_next_batch(now=True, until_visible=True):
+            while await self._custom.fold_next_batch(until_visible=True):
                 pass
         return count
 
     async def fold_next_batch(self, share: Share = WHOLE) -> bool:
         """Fold one batch of a share, or do one step of `fold_rest`; return False if nothing was behind the log."""
-        self._has_news = await self.fold_tables(share) is not None or await self.fold_rest(
-            now=self._has_news, share=share
-        )
-        return self._has_news
+        return await self.fold_tables(share) is not None or await self.fold_rest(share)
 
     async def fold_tables(self, share: Share) -> int | None:
         """Fold one batch of a share into the built-in tables; return as `FoldRunner.fold_next` does."""
@@ -127,14 +123,14 @@ class Projector:
         self._target.share = WHOLE
         return await self.runner.size()
 
-    async def fold_rest(self, *, now: bool, share: Share = WHOLE) -> bool:
+    async def fold_rest(self, share: Share = WHOLE) -> bool:
         """Refresh some rows of the materialised views or fold custom projections; return False if none was behind.
 
-        Unless `now` is true, custom projections are checked at intervals only. Of other shares than this one they are
-        folded seldom, because another process does that if it has their code.
+        Custom projections are checked at intervals only. Of other shares than this one they are folded seldom, because
+        another process does that if it has their code.
         """
         with self._log.translated():
-            return await self._refresh() or await self._custom.fold_next_batch(now=now, share=share)
+            return await self._refresh() or await self._custom.fold_next_batch(share=share)
 
     def _companions(self, events: int) -> Sequence[FoldRunner]:
         return self._custom.companions(events, until_visible=self._until_visible)

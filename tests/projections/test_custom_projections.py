@@ -171,24 +171,18 @@ async def test_a_change_reaches_a_row_of_an_earlier_batch(log: EventLog) -> None
     assert sorted(await ask(log, "SELECT arm, tries FROM grasp_tries_per_arm")) == [("LEFT", 6), ("RIGHT", 2)]
 
 
-async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
+async def test_events_that_no_batch_of_the_tables_folded_are_looked_for_at_intervals(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "_NEWEST_EPISODES", 1)
-    for name in ("_CHECK_S", "_SCAN_S_MAX"):
+    for name in ("_CHECK_S", "_CHECK_S_MAX"):
         monkeypatch.setattr(custom_tables, name, 1e9)
-    begun = [each for number in (1, 2, 3) for each in tries(number).records[:4]]
-    projector = await folded(log, [*declarations(PICK_UP), *begun], GraspRate())
-    # A process that folds the memory's own tables only leaves all three behind.
-    await folded(log, [*tries(1).records, *tries(2).records, *tries(3).records])
-    while await projector.fold_next_batch():
-        pass
-    assert await visible_rows(log) == [rows_of(1)[0], rows_of(2)[0], *rows_of(3)]
-    projector._custom._scan_due_s = 0
-    await log.append(tries(4).records[:4])
-    while await projector.fold_next_batch():
-        pass
-    assert await visible_rows(log) == [*rows_of(1), *rows_of(2), *rows_of(3), rows_of(4)[0]]
+    projector = await folded(log, [*declarations(PICK_UP), *tries(1).records[:4]], GraspRate())
+    await folded(log, tries(1).records)  # a process that folds the memory's own tables only
+    for due_s, rows in ((1e9, rows_of(1)[:1]), (0.0, rows_of(1))):
+        projector._custom._due_s = due_s
+        while await projector.fold_next_batch():
+            pass
+        assert await visible_rows(log) == rows
 
 
 async def test_simulations_are_left_out_unless_the_projection_asks_for_them(log: EventLog) -> None:

@@ -151,7 +151,7 @@ async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
 
 async def test_a_process_reads_an_event_once_and_after_a_restart_those_of_open_episodes_again(log: EventLog) -> None:
     tries = [("LEFT", "FAILED"), ("RIGHT", "SUCCEEDED"), ("LEFT", "SUCCEEDED")]
-    ended, still_open = episode(1, tries).records, episode(2, tries, ends=False).records
+    ended, still_open = episode(1, tries).records[:-1], episode(2, tries, ends=False).records
     await log.append(declarations(PICK_UP))
     Attempts.read.clear()
     projector = await projector_of(log)
@@ -164,7 +164,7 @@ async def test_a_process_reads_an_event_once_and_after_a_restart_those_of_open_e
     Attempts.read.clear()
     await (await projector_of(log)).catch_up()
     assert Attempts.read == Counter(f"2/{each.sequence}" for each in still_open)
-    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries, ends=False)]
+    assert await rows_in(log) == [each for number in (1, 2) for each in expected(number, tries, ends=False)]
 
 
 async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(

