@@ -56,7 +56,6 @@ from pycrorm_async.events.types import Happening
 from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import Layout, Storage, physical_name, unite
 from pycrorm_async.projections.fold import TableRows, decode_events
-from pycrorm_async.projections.generations import grow
 from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
@@ -413,7 +412,7 @@ class FoldRunner:
         if (generation.number, generation.revision) != (batch.number, types.revision):
             self.generation = generation
             return None
-        return await grow(connection, self._target, generation, types.payloads) if growing else generation
+        return await generations.grow(connection, self._target, generation, types.payloads) if growing else generation
 
     async def _write_rows(
         self, connection: AsyncConnection, batch: _PreparedBatch, generation: generations.Generation
