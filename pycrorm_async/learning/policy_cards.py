@@ -266,7 +266,7 @@ def _summary(
     learned_from = None if latest is None else latest.rollouts or latest.successes
     if isinstance(policy, SuccessModel):
         learned_from = policy.rollouts
-        robots |= {policy.robot} if policy.robot else set()
+    robots |= {policy.robot} if policy is not None and policy.robot else set()
     return PolicySummary(
         name, kind, tuple(sorted(robots)), tuple(sorted(objects)), learned_from, used, _share(counts),
         latest.learned_at if latest else None,
