@@ -645,6 +645,8 @@ class _Evaluator:
 
 KITCHEN = Scene(kitchen=True, collisions=True, torso_height=0.3)
 """The thesis' milk on the worktop, with the torso raised so that the arm can stay clear of the worktop."""
+KITCHEN_TRIAL = "picking up in the kitchen with a learned policy"
+"""The description of the episode of such a trial, in which `pycrorm learn --from-memory` does not learn."""
 
 
 @dataclass(frozen=True)
@@ -673,8 +675,7 @@ async def pick_up_in_kitchen(
     """
     tries, done, failure = 0, None, None
     async with Memory.open(place.url, spool=place.spool) as memory:
-        description = "picking up in the kitchen with a learned policy"
-        async with memory.episode(description=description, plan="learn", seed=seed) as episode:
+        async with memory.episode(description=KITCHEN_TRIAL, plan="learn", seed=seed) as episode:
             with scene.entered() as stage:
                 action = MoveAndPickUp(stage.target, policy=policy, rng=np.random.default_rng(seed))
                 try:

@@ -40,7 +40,7 @@ from sqlalchemy.orm import aliased
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.events.types import LinkBoxValue
-from pycrorm_async.learning.experiment import Learned, choices_of, rated
+from pycrorm_async.learning.experiment import KITCHEN_TRIAL, Learned, choices_of, rated
 from pycrorm_async.learning.features import NEAR_SURFACE_M, Edge, PickUpContext, edges_around
 from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
@@ -85,7 +85,10 @@ class RememberedPolicy:
 
 
 async def read_tries(reading: Reading) -> pd.DataFrame:
-    """Return the pick-ups that succeeded or failed, without those of simulated episodes.
+    """Return the pick-ups that succeeded or failed, without those of simulated episodes and of trials in the kitchen.
+
+    With such a trial `pycrorm learn` ends, in another world than that of its rollouts: what it tried is no reason to
+    ask which kind of pick-ups to learn from.
 
     A pick-up at a chosen place (`MoveAndPickUpAction`) counts from its start on, also if the robot did not reach the
     place, and the frame has the place to which the robot was sent: of this one a policy must know the success. Of any
@@ -165,6 +168,7 @@ def _tries(action: Any, node: Any, stand: Any, *columns: Any) -> Select[Any]:
         .join(place, and_(place.id == taken.pose_id, _episode(place) == _episode(taken)))
         .outerjoin(added, and_(added.id == taken.identity_id, _episode(added) == _episode(taken)))
         .where(node.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
+        .where(orm.ProcessMetaData.description.is_distinct_from(KITCHEN_TRIAL))
     )  # fmt: skip
 
 
