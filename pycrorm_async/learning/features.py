@@ -1,4 +1,4 @@
-"""Describe ways to pick an object up by the numbers that success depends on: the features "grasp-polar", version 2.
+"""Describe ways to pick an object up by the numbers that success depends on: the features "grasp-polar", version 3.
 
 >>> features_of([PickUpChoice(Arms.LEFT, Grasp.FRONT, -0.6, 0.1, torso=0.2)], PickUpContext(height=0.9))
 
@@ -23,11 +23,14 @@ lowering the object are the same. What is not known is NaN, such as the surface 
 | `wrist_ahead`, `wrist_aside` | m | of the wrist, from the base that faces the object; aside is to the arm's side |
 | `reach`, `reach_angle` | m, rad | along the floor, from the shoulder to the wrist, and its angle from straight ahead |
 | `stretch`, `elevation` | m, rad | from the shoulder to the wrist, and its angle from the floor |
+| `surface` | m | the height of the surface over the lifted torso |
+| `shoulder_clearance`, `wrist_clearance` | m | from the edge to shoulder and wrist; negative above the surface |
+| `arm_above` | m | along the floor, the part of the line from shoulder to wrist that is above the surface |
 
-The last three rows are those of version 2: the limit of an arm's reach is one threshold of `stretch`, where trees need
-many of distance, angle and height. Shoulder and wrist are taken to be where a PR2 has them, whatever the robot: with
-them a few centimetres off a model is half a point worse. Version 1 has the other features in the same order, so that
-its models are evaluated too.
+Version 2 added the rows from `wrist_ahead` on: the limit of an arm's reach is one threshold of `stretch`, where trees
+need many of distance, angle and height. Version 3 added those from `surface` on, by which an arm clears a table. Later
+versions have the features of the earlier ones first, so that models of these are evaluated too. Shoulder and wrist are
+taken to be where a PR2 has them, whatever the robot: with them a few centimetres off a model is half a point worse.
 
 All functions are pure: they know no world. `move_and_pick_up.context_of` reads a `PickUpContext` from the world.
 """
@@ -51,7 +54,7 @@ if TYPE_CHECKING:
 
 GRASP_POLAR: Final = "grasp-polar"
 """The name of the features, written into policy files."""
-GRASP_POLAR_VERSION: Final = 2
+GRASP_POLAR_VERSION: Final = 3
 """Raised when features are added, behind the others; a model of a later version is refused."""
 SHOULDER_M: Final = (0.188, 0.8)
 """The place of a PR2's shoulders: to the sides of the base's middle, and over the lifted torso."""
@@ -62,6 +65,7 @@ FEATURES: Final = (
     "width", "depth", "origin_height",
     "object_height", "edge_distance", "edge_to_base", "edge_to_grasp", "base_clearance",
     "wrist_ahead", "wrist_aside", "reach", "reach_angle", "stretch", "elevation",
+    "surface", "shoulder_clearance", "wrist_clearance", "arm_above",
 )  # fmt: skip
 
 PLACE: Final = ("robot_in_object_x", "robot_in_object_y")
@@ -187,6 +191,12 @@ def _features(
     behind, (aside_m, shoulder_m) = WRIST_M * (1 - top), SHOULDER_M
     wrist_ahead, wrist_aside = distance - behind * np.cos(angle), behind * np.sin(angle)
     reach, up = np.hypot(wrist_ahead, wrist_aside - aside_m), height + WRIST_M * top - shoulder_m
+    edge_to_base = side * _turned(edge_angle - bearing)
+    base_clearance = distance * np.cos(edge_to_base) - edge_distance
+    shoulder_clearance = base_clearance - aside_m * np.sin(edge_to_base)
+    wrist_clearance = behind * np.cos(edge_to_base + angle) - edge_distance
+    with np.errstate(divide="ignore", invalid="ignore"):  # a line along the edge is above the surface or is not
+        share_above = np.clip(wrist_clearance / (wrist_clearance - shoulder_clearance), 0.0, 1.0)
     features = {
         "top": top,
         "distance": distance,
@@ -198,15 +208,19 @@ def _features(
         # In the air the height over the floor does not count; a tree would split it by chance and extrapolate badly.
         "object_height": np.where(np.isnan(edge_distance), np.nan, object_height),
         "edge_distance": edge_distance,
-        "edge_to_base": side * _turned(edge_angle - bearing),
+        "edge_to_base": edge_to_base,
         "edge_to_grasp": side * _turned(edge_angle - hand),
-        "base_clearance": distance * np.cos(edge_angle - bearing) - edge_distance,
+        "base_clearance": base_clearance,
         "wrist_ahead": wrist_ahead,
         "wrist_aside": wrist_aside,
         "reach": reach,
         "reach_angle": np.arctan2(wrist_aside - aside_m, wrist_ahead),
         "stretch": np.hypot(reach, up),
         "elevation": np.arctan2(up, reach),
+        "surface": np.where(np.isnan(edge_distance), np.nan, height - known["origin_height"]),
+        "shoulder_clearance": shoulder_clearance,
+        "wrist_clearance": wrist_clearance,
+        "arm_above": reach * share_above,
     }
     return np.column_stack([features[name] for name in FEATURES])
 

@@ -182,7 +182,13 @@ plane no longer maps to the floor."""
 
 
 PROPOSALS = 2_000
-"""Ways to pick up of which a success model ranks the likeliest first."""
+"""Random ways to pick up that a success model ranks."""
+PARENTS, NEIGHBOURS, NEIGHBOUR_M = 50, 1_000, (0.05, 0.025)
+"""The likeliest ways, and the number of ways around them, that a success model ranks too, twice: at these standard
+deviations from them in x, y and the height of the torso, m. At a high table one way in thousands succeeds, of which
+random ones miss most."""
+ALIKE_M = 0.1
+"""The distance in m, of the base and of the torso, at which two ways with the same arm and grasp are half alike."""
 DRAWN_FROM = 100
 """Ways to pick up of which one is drawn in a rollout: more would give nothing but a slower rollout."""
 
@@ -236,7 +242,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         arms, grasps: the allowed ones; None allows all.
         policy: the distribution of base positions, arms and grasps; None means the thesis' default policy. With a
             `SuccessModel` the likeliest of `PROPOSALS` ways of the default policy, each with a random height of the
-            torso, are tried; each alternative has its `probability`, so that a plan can refuse one below a bound.
+            torso, and of ways around these are tried, and ways like earlier ones later; each alternative has its
+            `probability`, so that a plan can refuse one below a bound.
         samples: number of alternatives.
         rng: random generator; None means a new one with an unpredictable seed.
 
@@ -399,23 +406,20 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return self._predicted(self._model, [choice], context)[0]
 
     def _ranked(self) -> Iterator[MoveAndPickUpPerformable]:
-        choices, rates = self.rated(max(PROPOSALS, self.samples))
+        choices, rates = self.rated(max(PROPOSALS, self.samples), searched=True)
         clearance = base_clearance()
-        clear = (
-            choices[number]
-            for number in np.argsort(-rates, kind="stable").tolist()
-            if clearance is None or self.is_clear(choices[number], clearance)
-        )
+        clear = _diverse_ranking(choices, rates, lambda each: clearance is None or self.is_clear(each, clearance))
         first = next(clear, None)
         if first is None:
             raise self._nowhere()
         for choice in islice(chain([first], clear), self.samples):
             yield self.way(choice)
 
-    def rated(self, count: int) -> tuple[Sequence[PickUpChoice], Floats]:
+    def rated(self, count: int, *, searched: bool = False) -> tuple[Sequence[PickUpChoice], Floats]:
         """Draw ways to pick up at free places, and rate each: a model's probability, or a policy's density.
 
-        Where collisions count, the base may collide at its heading there (`is_clear`). Raises `ObjectUnreachable`.
+        With `searched`, those follow that a success model finds around the likeliest ones. Where collisions count, the
+        base may collide at its heading there (`is_clear`). Raises `ObjectUnreachable`.
         """
         policy, model = self.grounded(), self._model
         if model is None:
@@ -426,7 +430,34 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             proposals = self._polar_ways(model, self._rng, count, context, policy)
             return proposals, model.likelihood(proposals, context)
         choices = self.lifted(policy.sample(self._rng, count), self._rng, context)
-        return choices, model.probability(choices, context)
+        rates = model.probability(choices, context)
+        for off_m in NEIGHBOUR_M if searched and model.trees else ():
+            near = self._neighbours(choices, rates, off_m, context, policy)
+            choices, rates = [*choices, *near], np.concatenate([rates, model.probability(near, context)])
+        return choices, rates
+
+    def _neighbours(
+        self, choices: Sequence[PickUpChoice], rates: Floats, off_m: float, context: PickUpContext, policy: Policy
+    ) -> list[PickUpChoice]:
+        """Return random ways around the likeliest ones, at free places."""
+        clearance, region = base_clearance(), policy.evidence.region
+        ordered = (choices[number] for number in np.argsort(-rates, kind="stable").tolist())
+        parents = [*islice((each for each in ordered if clearance is None or self.is_clear(each, clearance)), PARENTS)]
+        if not parents:
+            return []
+        low, high = context.torso_limits or (0.0, 0.0)
+        drawn = self._rng.integers(len(parents), size=NEIGHBOURS).tolist()
+        offsets = self._rng.normal(0.0, off_m, (NEIGHBOURS, 3)).tolist()
+        near = [
+            each._replace(
+                relative_x=each.relative_x + dx,
+                relative_y=each.relative_y + dy,
+                torso=None if each.torso is None else min(max(each.torso + dz, low), high),
+            )
+            for each, (dx, dy, dz) in zip((parents[number] for number in drawn), offsets, strict=True)
+        ]
+        places = np.array([each[2:4] for each in near]).T
+        return near if region is None else list(compress(near, region.contains(*places)))
 
     def way(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
         """Return the action for this choice, with the prediction of a model."""
@@ -566,6 +597,43 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return MoveAndPickUpPerformable(
             standing_position, self.target, choice.arm, choice.grasp, policy=self.policy_name
         )
+
+
+class Likeness:
+    """How alike each of these choices is to another: 1 to 0, a half at a distance of `ALIKE_M`; 0 for another grasp."""
+
+    def __init__(self, choices: Sequence[PickUpChoice]) -> None:
+        self._holds = np.array([_hold_number(each) for each in choices])
+        self._places = np.array([_place(each) for each in choices]).reshape(-1, 3)
+
+    def to(self, one: PickUpChoice) -> Floats:
+        """Return the likeness of each choice to this one, shape (choices,)."""
+        off = np.linalg.norm(self._places - _place(one), axis=1)
+        return np.asarray((self._holds == _hold_number(one)) * 0.5 ** (off / ALIKE_M) ** 2)
+
+
+def _hold_number(choice: PickUpChoice) -> int:
+    return ARMS.index(choice.arm) * len(GRASPS) + GRASPS.index(choice.grasp)
+
+
+def _place(choice: PickUpChoice) -> tuple[float, float, float]:
+    return choice.relative_x, choice.relative_y, choice.torso or 0.0
+
+
+def _diverse_ranking(
+    choices: Sequence[PickUpChoice], rates: Floats, possible: Callable[[PickUpChoice], bool]
+) -> Iterator[PickUpChoice]:
+    """Yield the possible choices, the likeliest first; those like one that was yielded before count less.
+
+    So the tries that follow a failure differ from it: the likeliest ways are all around the same place.
+    """
+    left, likeness = np.array(rates), Likeness(choices)
+    while (left >= 0).any():
+        best = int(left.argmax())
+        left[best] = -1.0
+        if possible(choices[best]):
+            yield choices[best]
+            left[left > 0] *= 1 - likeness.to(choices[best])[left > 0] / 2
 
 
 def _own_arms(among: Iterable[Arms], target: objects.ObjectLike) -> tuple[Arms, ...]:

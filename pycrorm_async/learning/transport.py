@@ -33,6 +33,7 @@ from pycrorm_async.errors import ImpossibleCondition
 from pycrorm_async.learning.features import PickUpContext
 from pycrorm_async.learning.move_and_pick_up import (
     HEIGHT_TOLERANCE_M,
+    Likeness,
     MoveAndPickUp,
     RecalledPickUp,
     context_of,
@@ -59,8 +60,6 @@ FETCHING_SEARCHES, PLACING_SEARCHES = 2, 4
 """The searches that follow one another until a way is possible."""
 _TURN_RAD = math.pi / 2
 """The greatest angle between the goal and the robot's heading in all searches for placing but the first."""
-_ALIKE_M = 0.1
-"""The distance in m, of the base and of the torso, at which two ways with the same arm and grasp are half alike."""
 
 
 class TransportPolicy:
@@ -120,10 +119,11 @@ class TransportPolicy:
         for _ in range(FETCHING_SEARCHES if holds else 0):
             ways = self.ways(self.stands(obj.pose, region=region), holds, goals, context)
             choices, hold_of = ways.choices, ways.holds
+            likeness = Likeness(choices)
             chances = self.chances(choices, context)
             chances *= np.array([weights.get(each, 1.0) for each in hold_of.tolist()])
             for each in tried:
-                chances *= 1 - _alike(each, choices) / 2
+                chances *= 1 - likeness.to(each) / 2
             while chances.any():
                 await asyncio.sleep(0)  # a search may take seconds
                 best = int(chances.argmax())
@@ -137,7 +137,7 @@ class TransportPolicy:
                     chances[best] = 0.0
                     yield action.way(choice)
                     tried.append(choice)
-                    chances *= 1 - _alike(choice, choices) / 2
+                    chances *= 1 - likeness.to(choice) / 2
 
     def reaches(self, way: MoveAndPickUpPerformable, torso: float | None = None) -> bool:
         """Return whether the arm, parked before, reaches all goals of the pick-up with the torso at this height, m."""
@@ -359,10 +359,3 @@ def _reach_m(robot: objects.CurrentRobot) -> float:
             chain_of(robot.body, arm).reach_m + math.hypot(*shoulder.relative_to(robot.body.pose).position[:2])
         )
     return max(reaches)
-
-
-def _alike(one: PickUpChoice, choices: Sequence[PickUpChoice]) -> Floats:
-    """Return how alike each choice is to one: 1 to 0, a half at a distance of `_ALIKE_M`; 0 for another grasp."""
-    same = np.array([each[:2] == one[:2] for each in choices])
-    off = [math.dist((*each[2:4], each.torso or 0.0), (*one[2:4], one.torso or 0.0)) for each in choices]
-    return np.asarray(same * 0.5 ** (np.array(off) / _ALIKE_M) ** 2)
