@@ -12,8 +12,9 @@
 
 A model learns in the scene in which it is tried, from other seeds. The ceiling is the rate that no choice of a way can
 exceed: with errors of the object the chance that it is between the fingers and does not slip, for the best grasp; at a
-table the share of scenes in which the first try or any way from a grid of places (`bench.tasks`) works. Errors are
-standard deviations, intervals are of 95 %. The script prints one JSON line; the table is on stderr.
+table the share of scenes in which the first try or any way from a grid of places (`bench.tasks`) works. *Predicted* is
+the mean chance that the model gave to the first tries. Errors are standard deviations, intervals are of 95 %. The
+script prints one JSON line; the table is on stderr.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -81,17 +82,27 @@ def grip_ceiling(target: Object, errors: Disturbance) -> float:
     return max(held)
 
 
-async def tried(stage: Stage, policy: AnyPolicy, index: int) -> tuple[str, bool, bool]:
-    """Return the object, whether the likeliest way picks it up, and, without errors, whether any way does."""
+class Try(NamedTuple):
+    """The first try in a scene: the chance that the model gave it, its success, and, at a table, that of any way."""
+
+    predicted: float
+    done: bool
+    possible: bool
+
+
+async def tried(stage: Stage, policy: AnyPolicy, index: int) -> tuple[str, Try]:
+    """Return the object, and how its likeliest way ends."""
     stage.reset()
     target = stage.prepare(TRIED, index)
-    rng = np.random.default_rng((TRIED, index, 3))
+    rng, predicted = np.random.default_rng((TRIED, index, 3)), 0.0
     with suppress(PlanFailure):
-        await next(iter(MoveAndPickUp(target, policy=policy, samples=1, rng=rng))).perform()
-        return target.name, True, True
+        way: Any = next(iter(MoveAndPickUp(target, policy=policy, samples=1, rng=rng)))
+        predicted = way.probability
+        await way.perform()
+        return target.name, Try(predicted, True, True)
     stage.reset()
     stage.prepare(TRIED, index)
-    return target.name, False, stage.scene.table and any(holds(target))
+    return target.name, Try(predicted, False, stage.scene.table and any(holds(target)))
 
 
 async def measure(name: str, folder: Path, scenes: int, rollouts: int | None) -> list[dict[str, Any]]:
@@ -100,38 +111,43 @@ async def measure(name: str, folder: Path, scenes: int, rollouts: int | None) ->
     file = folder / f"{'tasks_none' if name == 'table' else name}_{count}.json"
     if not file.exists():
         save_policy(await learned(case.scene, 1_000, rollouts=count), file)
-    policy, ends = load_policy(file), defaultdict(list)
+    policy, ends = load_policy(file), defaultdict[str, list[Try]](list)
     with case.scene.entered() as stage:
         for index in range(scenes):
-            kind, done, possible = await tried(stage, policy, index)
-            ends[kind].append((done, possible))
+            kind, end = await tried(stage, policy, index)
+            ends[kind].append(end)
         ceilings = {each.name: grip_ceiling(each, case.scene.disturbance) for each in stage.targets}
-    rows: list[dict[str, Any]] = []
-    for kind, flags in ends.items():
-        successes, solvable, count = sum(each for each, _ in flags), sum(each for _, each in flags), len(flags)
-        ceiling = solvable / count if case.scene.table else ceilings[kind]
+    everything = [end for each in ends.values() for end in each]
+    if not case.scene.table:
+        ceilings["all"] = sum(len(each) * ceilings[kind] for kind, each in ends.items()) / len(everything)
+    rows = []
+    for kind, tries in {**ends, "all": everything}.items():
+        count, successes = len(tries), sum(each.done for each in tries)
         rate = successes / count
+        ceiling = sum(each.possible for each in tries) / count if case.scene.table else ceilings[kind]
         rows.append({
             "case": name, "object": kind, "scenes": count, "first_try": round(rate, 4),
             "interval": [round(each, 3) for each in interval_95(successes, count)], "ceiling": round(ceiling, 4),
             "of_ceiling": round(rate / ceiling, 4) if ceiling else None,
-        })  # fmt: skip
-    if case.scene.table:
-        successes, solvable = (sum(each[at] for flags in ends.values() for each in flags) for at in (0, 1))
-        rows.append({
-            "case": name, "object": "all", "scenes": scenes, "first_try": round(successes / scenes, 4),
-            "interval": [round(each, 3) for each in interval_95(successes, scenes)],
-            "ceiling": round(solvable / scenes, 4), "of_ceiling": round(successes / solvable, 4) if solvable else None,
+            "predicted": round(sum(each.predicted for each in tries) / count, 4),
         })  # fmt: skip
     return rows
 
 
 def show(rows: list[dict[str, Any]]) -> None:
-    table = Table("case", "object", "scenes", "first try", "ceiling", "of the ceiling")
+    table = Table("case", "object", "scenes", "first try", "ceiling", "of the ceiling", "predicted")
     for each in rows:
         rate = "{:.1%} ({:.1%}-{:.1%})".format(each["first_try"], *each["interval"])
         share = "" if each["of_ceiling"] is None else f"{each['of_ceiling']:.1%}"
-        table.add_row(each["case"], each["object"], str(each["scenes"]), rate, f"{each['ceiling']:.1%}", share)
+        table.add_row(
+            each["case"],
+            each["object"],
+            str(each["scenes"]),
+            rate,
+            f"{each['ceiling']:.1%}",
+            share,
+            f"{each['predicted']:.1%}",
+        )
     Console(stderr=True, width=110).print(table)
 
 
