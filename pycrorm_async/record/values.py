@@ -664,6 +664,8 @@ _FAILURE_NAME_MAX = 500
 """Bounds the characters of an exception's qualified class name."""
 _GROUP_MAX = 100
 """Bounds the recorded exceptions of one exception group."""
+_ARGS: Final = BaseException.__dict__["args"].__get__
+"""Reads the arguments that an exception was made with, also of a class that has an attribute `args` of its own."""
 
 
 class FailureCopies:
@@ -680,9 +682,9 @@ class FailureCopies:
         self, failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
     ) -> event_types.FailureValue:
         """Copy class, message and arguments of an exception. Raises no `Exception`."""
-        if not isinstance(failure, BaseException):  # whatever an executive gave
+        if not issubclass(type(failure), BaseException):  # whatever an executive gave, which may deny its class
             return failure_value(failure, references, convert)
-        arguments, message = failure.args, message_of(failure)
+        arguments, message = _ARGS(failure), message_of(failure)
         if self._last is not None:
             copied, former_arguments, former_message, value = self._last
             if copied() is failure and former_arguments is arguments and former_message == message:
@@ -718,7 +720,8 @@ def _name_of(failure: BaseException) -> str:
 def _arguments(failure: BaseException, references: References, convert: Callable[[Any], Any], depth: int) -> list[Any]:
     """Encode the arguments of an exception; for a group, its message and the encoded exceptions inside it."""
     if not isinstance(failure, BaseExceptionGroup):
-        return [encode_or_missing(convert(each), references) for each in getattr(failure, "args", ())]
+        values = _ARGS(failure) if issubclass(type(failure), BaseException) else ()
+        return [encode_or_missing(convert(each), references) for each in values]
     if depth > DEPTH_MAX:
         return [missing_value(f"it is nested more than {DEPTH_MAX} deep", failure)]
     inside = [

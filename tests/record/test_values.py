@@ -2,6 +2,7 @@
 
 import enum
 import math
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
 
@@ -12,7 +13,14 @@ from pycrorm_async.events.types import FieldDeclared, FieldType, MissingValue, O
 from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
 from pycrorm_async.plan.language import Outcome
 from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
-from pycrorm_async.record.values import UnrecordableValue, clean_repr, encode_or_missing, encoder_of, failure_value
+from pycrorm_async.record.values import (
+    FailureCopies,
+    UnrecordableValue,
+    clean_repr,
+    encode_or_missing,
+    encoder_of,
+    failure_value,
+)
 from pycrorm_async.world.pose import Arms, ObjectType, Pose
 
 
@@ -155,6 +163,17 @@ def test_a_failure_whose_message_raises_is_kept_without_it() -> None:
             raise RuntimeError
 
     assert failure_value(Mute(), NOBODY).message == "<its __str__ raised RuntimeError>"
+
+
+def test_a_failure_with_a_field_named_args_keeps_the_arguments_that_it_was_made_with() -> None:
+    @dataclass
+    class ToolFailed(Exception):
+        command: str
+        args: Any = None
+
+    for copy in (failure_value, FailureCopies().copy):
+        assert copy(ToolFailed("grasp", ["left"]), NOBODY).arguments == ["grasp", ["left"]]
+        assert copy(ToolFailed("grasp"), NOBODY).arguments == ["grasp"]
 
 
 def test_a_group_keeps_each_failure_with_class_message_and_arguments() -> None:
