@@ -30,15 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import ImpossibleCondition
+from pycrorm_async.learning import move_and_pick_up
 from pycrorm_async.learning.features import PickUpContext
-from pycrorm_async.learning.move_and_pick_up import (
-    HEIGHT_TOLERANCE_M,
-    Likeness,
-    MoveAndPickUp,
-    RecalledPickUp,
-    context_of,
-    free_and_visible,
-)
 from pycrorm_async.learning.policy import Evidence, Floats, PickUpChoice, Policy, Region
 from pycrorm_async.learning.policy_file import AnyPolicy
 from pycrorm_async.learning.success_model import SuccessModel
@@ -102,15 +95,15 @@ class TransportPolicy:
             return self.takes(target, arm, grasp)
 
         if self._recalls:
-            async for recalled in RecalledPickUp(target, arms).recalled():
+            async for recalled in move_and_pick_up.RecalledPickUp(target, arms).recalled():
                 hold = recalled.arm, recalled.grasp
                 if takes(*hold) and self.reaches(recalled) and await places.chance(*hold):
                     yield recalled
-        action = MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
+        action = move_and_pick_up.MoveAndPickUp(target, arms, policy=self.policy, rng=self._rng)
         action.keep_policy()
         obj = objects.in_world(target)
         robot = objects.require_robot()
-        region, context = free_and_visible(robot, obj), action.context_for(self.policy)
+        region, context = move_and_pick_up.free_and_visible(robot, obj), action.context_for(self.policy)
         holds = [hold for hold in product(arms, Grasp) if takes(*hold)]
         known = 0 if robot.description.approaches_along_fingers else 1  # of others the first depends on the base
         goals = [geometry.pick_up_poses(robot.description, obj.pose, grasp, Pose())[known:] for _, grasp in holds]
@@ -119,7 +112,7 @@ class TransportPolicy:
         for _ in range(FETCHING_SEARCHES if holds else 0):
             ways = self.ways(self.stands(obj.pose, region=region), holds, goals, context)
             choices, hold_of = ways.choices, ways.holds
-            likeness = Likeness(choices)
+            likeness = move_and_pick_up.Likeness(choices)
             chances = self.chances(choices, context)
             chances *= np.array([weights.get(each, 1.0) for each in hold_of.tolist()])
             for each in tried:
@@ -241,7 +234,8 @@ class TransportPolicy:
             with suppress(ImpossibleCondition):
                 if isinstance(self.policy, Policy):
                     height = context.height - context.torso
-                    near = Evidence(height=(height - HEIGHT_TOLERANCE_M, height + HEIGHT_TOLERANCE_M))
+                    tolerance = move_and_pick_up.HEIGHT_TOLERANCE_M
+                    near = Evidence(height=(height - tolerance, height + tolerance))
                     density = self.policy.condition(near).likelihood(choices)
                 else:
                     density = self.policy.likelihood(choices, context)
@@ -271,7 +265,7 @@ class Places:
 
     def __init__(self, ways: TransportPolicy, target: Object, goal: Pose) -> None:
         self._ways, self._target, self._goal = ways, target, goal
-        self._context = context_of(target, at=goal)
+        self._context = move_and_pick_up.context_of(target, at=goal)
         self._searches: list[list[Stand]] = []
         self._chances: dict[tuple[Arms, Grasp], float] = {}
 
