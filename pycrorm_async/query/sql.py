@@ -85,7 +85,8 @@ def _value(value: Any) -> Any:
 # 4. A function that PostgreSQL declares VOLATILE may have effects that no rollback undoes: it ends other sessions,
 #    takes locks, changes settings, runs a text as SQL. A text with the name of one, or of an operator or aggregate over
 #    one, is refused. Strings and comments count too, because leaving them out would need PostgreSQL's own lexer. A
-#    superuser's query calls no function but PostgreSQL's own, because others may run a text without being volatile.
+#    query of a superuser or of the log's owner calls no function but PostgreSQL's own, because others may run a text,
+#    such as a call of `set_config`, without being volatile.
 #    What the text does not name is not checked: a view, a cast or a type that calls such a function.
 #
 # The cursor returns with each row the sum of the bytes up to it, and empty values from the bound on, because one value
@@ -99,16 +100,17 @@ _BEGIN = (
     "SET LOCAL idle_in_transaction_session_timeout = '10min'",  # a pager stops reading for minutes
 )
 _MAY_TAKE = f"""
-SELECT session_user::text AS login, has_schema_privilege(to_regrole('{READER}'), '{VIEWS_SCHEMA}', 'USAGE') AS exists,
+SELECT quote_ident(session_user) AS login,
+    has_schema_privilege(to_regrole('{READER}'), '{VIEWS_SCHEMA}', 'USAGE') AS exists,
     pg_has_role(session_user, to_regrole('{READER}'), 'MEMBER') AS is_member"""
 """Selects whether this memory has the role of readers, and whether the login may take it."""
 
-_VOLATILE = """
+_VOLATILE = f"""
 SELECT 'function ' || f.proname FROM pg_proc AS f JOIN pg_namespace ON pg_namespace.oid = f.pronamespace
-JOIN pg_roles AS login ON login.rolname = session_user
 LEFT JOIN pg_aggregate ON aggfnoid = f.oid LEFT JOIN pg_proc AS transition ON transition.oid = aggtransfn
 WHERE ('v' IN (f.provolatile, transition.provolatile)
-    OR login.rolsuper AND nspname NOT IN ('pg_catalog', 'information_schema'))
+    OR nspname NOT IN ('pg_catalog', 'information_schema')
+    AND pg_has_role(session_user, (SELECT nspowner FROM pg_namespace WHERE nspname = '{LOG_SCHEMA}'), 'MEMBER'))
 AND f.proname = ANY($1::text[]) AND f.proname <> ALL($2)
 AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
 UNION ALL
@@ -116,7 +118,7 @@ SELECT 'operator ' || oprname FROM pg_operator JOIN pg_proc ON pg_proc.oid = opr
 JOIN pg_namespace ON pg_namespace.oid = oprnamespace
 WHERE provolatile = 'v' AND strpos($3, oprname) > 0
 AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
-LIMIT 1"""
+LIMIT 1"""  # noqa: S608  our own names only
 """Selects a function or an operator of the text that may have effects. One of another schema is called with its schema
 only."""
 _HARMLESS = (

@@ -44,8 +44,8 @@ def is_sqlite(url: str) -> bool:
 
 def login(url: str, attributes: str, *after: str) -> str:
     """Return the URL of a new login with these attributes."""
-    name = f"login_{next(_NUMBERS)}_of_{urlsplit(url).path.removeprefix('/')}"
-    change_each(url, [f"CREATE ROLE {name} LOGIN {attributes}", *(each.format(name=name) for each in after)])
+    name = f"login-{next(_NUMBERS)}-of-{urlsplit(url).path.removeprefix('/')}"
+    change_each(url, [f'CREATE ROLE "{name}" LOGIN {attributes}', *(each.format(name=f'"{name}"') for each in after)])
     return url.replace("postgres@", f"{name}@")
 
 

@@ -206,8 +206,15 @@ async def test_a_query_runs_as_the_reader_and_a_login_that_may_not_take_this_rol
     async with opened_reader(login(url, "IN ROLE pycrorm_recorder, pycrorm_reader")) as sql:
         assert (await sql.query(who))[1] == [("pycrorm_reader", 2)]
     async with opened_reader(login(url, "IN ROLE pycrorm_recorder")) as sql:
-        with pytest.raises(QueryRefused, match=r"which login_.* may not take: GRANT pycrorm_reader TO login_"):
+        with pytest.raises(QueryRefused, match=r'which "login-.*" may not take: GRANT pycrorm_reader TO "login-.*"$'):
             await sql.query(who)
+    body = "$$ BEGIN PERFORM set_config('role', 'none', true); RETURN current_user; END $$"
+    leave = f"CREATE FUNCTION public.leave() RETURNS text IMMUTABLE LANGUAGE plpgsql AS {body}"
+    owner = login(url, "IN ROLE pycrorm_reader", "ALTER SCHEMA pycrorm OWNER TO {name}", leave)
+    async with opened_reader(owner) as sql:
+        assert (await sql.query(who))[1] == [("pycrorm_reader", 2)]
+        with pytest.raises(QueryRefused, match="the function leave can do more and is not allowed"):
+            await sql.query("SELECT public.leave()")
 
 
 async def test_a_volatile_function_is_refused_however_its_name_is_written_and_behind_an_operator(
