@@ -26,8 +26,8 @@ class VisibleConsole(Console):
         return bool(self.file.isatty())
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return a text, also that of a cell, as rich prints it."""
-        return super().render_str(visible(text), **options)
+        """Return a text, also that of a cell, as rich prints it, but with words like `:robot:` as they are."""
+        return super().render_str(visible(text), **{**options, "emoji": False})
 
 
 stderr = VisibleConsole(stderr=True, highlight=False, soft_wrap=True)

@@ -183,7 +183,7 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
         (("--model", "polar", "--study", "5"), 2, "--study needs --model places, got --model polar"),
         (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
         (("--robot", "lifter"), 2, "--robot lifter is not known: pr2, courier, tiago_pro or FILE.py:NAME"),
-        (("--robot", "none.py:LIFTER"), 2, "--robot none.py:LIFTER: the file 'none.py' does not exist"),
+        (("--robot", "none.py:ROBOT"), 2, "--robot none.py:ROBOT: the file 'none.py' does not exist"),
         (("--base-noise", "1", "0"), 2, "--base-noise needs --model polar or success"),
         (("--object-noise", "-1", "0"), 2, "object_m of a disturbance must be finite and >= 0, got -1.0"),
         (("--rollouts", "9", "--min-samples-leaf", "10"), 2, "choose a larger --rollouts (rollouts=) or a smaller"),
