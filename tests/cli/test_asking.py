@@ -127,13 +127,14 @@ def test_a_query_is_printed_as_a_table_as_csv_and_as_json(folder: Path) -> None:
     assert "more" not in pycrorm("query", sql, "--limit", "0", cwd=folder).stderr
 
 
-def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets(folder: Path) -> None:
-    columns = "1 AS '[/x]', 2 AS '[red]y'"
+def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets_and_colons(folder: Path) -> None:
+    columns = "1 AS '[/x]', 2 AS '[red]y', 3 AS ':fire:'"
     for sql in (f"SELECT {columns}", f"SELECT task_tree_node.*, {columns} FROM task_tree_node LIMIT 1"):  # also a block
         shown = pycrorm("query", sql, cwd=folder)
         assert (shown.returncode, shown.stderr) == (0, "")
         assert "[/x]" in shown.stdout
         assert "[red]y" in shown.stdout
+        assert ":fire:" in shown.stdout
 
 
 @pytest.mark.parametrize(
@@ -141,6 +142,7 @@ def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets(folder: Path) -
     [
         (["DELETE FROM event"], "a query may only read: it is one SELECT, or WITH … SELECT; DELETE is not allowed"),
         (["ATTACH 'planted.db' AS planted"], "ATTACH or VACUUM is not allowed"),
+        (["SELECT * FROM ':x:'"], "there is no table or view :x:; `pycrorm schema` lists them"),
         (["SELECT * FROM root_failures"], "there is no table or view root_failures; did you mean root_failure?"),
         (["SELECT 1; SELECT 2"], "a query is one statement: this text has several"),
         (["SELECT 1", "--seconds", "-1"], "the limit on seconds of a query must be > 0 and finite, got -1.0"),
