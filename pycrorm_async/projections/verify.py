@@ -565,7 +565,7 @@ async def _check_heads(log: EventLog, within: findings.EpisodeRange, result: fin
 class _TablesCheck:
     """The check of the log and of the built-in tables. Implements `TableCheck`."""
 
-    missing_table = "a table is missing: run `pycrorm rebuild`, or verify again if one has just ended"
+    missing_table = "a table is missing: run `pycrorm rebuild`, or verify again if a rebuild has just ended"
 
     def __init__(self, log: EventLog, result: findings.VerifyResult) -> None:
         self._log = log
@@ -692,7 +692,7 @@ class ProjectionCheck:
         self._projection = projection
         self.result = result
         name = projection.name
-        advice = f"run `pycrorm rebuild {name}`, or verify again if one has just ended"
+        advice = f"run `pycrorm rebuild {name}`, or verify again if a rebuild has just ended"
         self.missing_table = f"a table of the projection {name} is missing: {advice}"
         self._comparison: findings.Comparison | None = None
         self._part = findings.EpisodeRange()

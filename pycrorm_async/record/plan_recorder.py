@@ -731,8 +731,8 @@ def _model(added: Object) -> tuple[str | None, str | None]:
 # in `omitted`, and the next one holds all changes since the last written sample.
 #
 # One condition variable guards the running motions. All samples are taken while it is held, so no sample follows the
-# end of its motion. Its lock is reentrant, because the garbage collector may close a dropped plan, and so call `end`,
-# in a thread that holds the lock.
+# end of its motion, with one exception: the garbage collector may close a dropped plan, and so call `end`, in the
+# thread that takes a sample of it. So the lock is reentrant.
 
 
 class _Motion:
