@@ -30,7 +30,7 @@ class VisibleConsole(Console):
         return super().render_str(visible(text), **{**options, "emoji": False})
 
 
-stderr = VisibleConsole(stderr=True, highlight=False, emoji=False, soft_wrap=True)
+stderr = VisibleConsole(stderr=True, highlight=False, soft_wrap=True)
 """The only console for stderr, because rich redraws a bar below other output only if both use one console."""
 
 

@@ -34,9 +34,7 @@ _WORD_MAX = 24
 _READABLE = 0.75
 """The least part of the width its words need at which a table is printed; with less, it would break most words."""
 
-stdout = VisibleConsole(
-    highlight=False, emoji=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED
-)
+stdout = VisibleConsole(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
 
 
 def problem(line: str) -> None:
