@@ -49,6 +49,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.engines import engine_class
+from pycrorm_async.world.pose import Arms
 from pycrorm_async.world.urdf import PR2, TIAGO_PRO, Limits, RobotDescription, robot_description
 
 LEAVES = {Learned.PLACES: 25, Learned.POLAR: 20, Learned.SUCCESS: 10}
@@ -280,6 +281,8 @@ def _robot(reference: str) -> str | RobotDescription:
         described = getattr(import_file(path), name, None)
         if not isinstance(described, RobotDescription):
             raise CallerError(f"--robot {reference}: the file has no RobotDescription {name!r}: describe it there")
+        if Arms.LEFT not in described.arms and Arms.RIGHT not in described.arms:
+            raise CallerError(f"--robot {reference}: the description has no LEFT or RIGHT arm to pick up with: add one")
         return described
     if robot_description(reference) is None:
         extra = ", which needs pip install 'pycrorm-async[pr2]'" if reference == TIAGO_PRO else ""

@@ -86,9 +86,10 @@ def test_a_policy_is_learned_from_the_rollouts_of_an_experiment(document: Any, f
 
 
 OWN_ROBOT = """from dataclasses import replace
-from pycrorm_async.world import COURIER
+from pycrorm_async.world import COURIER, Arms
 from pycrorm_async.world.models import built_in_model
 SCOUT = replace(COURIER, name="scout", urdf=built_in_model("courier"))
+CENTRAL = replace(SCOUT, arms={Arms.named("CENTRE"): SCOUT.arms[Arms.RIGHT]})
 """
 
 
@@ -184,6 +185,7 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
         (("--heights", "1.2", "0.6"), 2, "heights of a scene are an interval (low, high) in m"),
         (("--robot", "lifter"), 2, "--robot lifter is not known: pr2, courier, tiago_pro or FILE.py:NAME"),
         (("--robot", "none.py:ROBOT"), 2, "--robot none.py:ROBOT: the file 'none.py' does not exist"),
+        (("--robot", "robots.py:CENTRAL"), 2, "--robot robots.py:CENTRAL: the description has no LEFT or RIGHT arm"),
         (("--base-noise", "1", "0"), 2, "--base-noise needs --model polar or success"),
         (("--object-noise", "-1", "0"), 2, "object_m of a disturbance must be finite and >= 0, got -1.0"),
         (("--rollouts", "9", "--min-samples-leaf", "10"), 2, "choose a larger --rollouts (rollouts=) or a smaller"),
@@ -193,6 +195,7 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
 )
 def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
     (tmp_path / "folder.png").mkdir()
+    (tmp_path / "robots.py").write_text(OWN_ROBOT)
     done = pycrorm(*BY_ONE, *arguments, cwd=tmp_path)
     assert words in one_line_of(done)
     assert done.returncode == code
