@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra
 from pycrorm_async.world.pose import Arms, Grasp
+from pycrorm_async.world.urdf import PR2
 
 # === evidence =================================================================================================
 
@@ -325,7 +326,7 @@ class Policy:
         evidence: the condition.
         constant_height: the height over the torso, m, if all samples it was learned from had the same one. Such a
             policy applies to every height; its success at other heights is not known.
-        robot: the name of the robot whose pick-ups it was learned from; None if it is not known.
+        robot: the name of the robot whose pick-ups it was learned from; None for the default policy, of any robot.
 
     Raises `ImpossibleCondition` if the evidence has probability 0.
     """
@@ -333,7 +334,7 @@ class Policy:
     leaves: tuple[Leaf, ...]
     evidence: Evidence = field(default_factory=Evidence)
     constant_height: float | None = None
-    robot: str | None = None
+    robot: str | None = PR2.name
 
     def __post_init__(self) -> None:
         if not self._mass > 0:
@@ -514,7 +515,7 @@ def default_policy() -> Policy:
     """
     place = Normal(0.0, math.sqrt(VARIANCE_M2))
     anywhere = Leaf(1.0, (1 / len(ARMS),) * len(ARMS), (1 / len(GRASPS),) * len(GRASPS), place, place)
-    return Policy((anywhere,), Evidence(region=AROUND_OBJECT))
+    return Policy((anywhere,), Evidence(region=AROUND_OBJECT), robot=None)
 
 
 # === policy plot ==============================================================================================

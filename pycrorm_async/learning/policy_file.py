@@ -11,9 +11,10 @@ Numbers are written with all their digits, so that a policy read back gives the 
 from an untrusted source cannot run code. Reading a policy and sampling it need none of the packages that learning
 needs.
 
-A tree of places is written in version 1, which earlier releases read. The others have version 2: the second line opens
-with their `kind` and has the name and version of the features they were learned with. A tree that names its robot has
-version 3. The memory holds the second line alone, as the content that the name of a policy is the hash of.
+A tree of places is written in version 1, which earlier releases read. It names no robot and is read as one for the PR2,
+because only this robot was learned for then. The others have version 2: the second line opens with their `kind` and has
+the name and version of the features they were learned with. A tree that names its robot has version 3. The memory
+holds the second line alone, as the content that the name of a policy is the hash of.
 """
 
 from __future__ import annotations
@@ -33,12 +34,15 @@ from pycrorm_async.learning.polar_policy import PolarPolicy
 from pycrorm_async.learning.policy import ARMS, GRASPS, Evidence, Leaf, Policy, Rectangle, Region
 from pycrorm_async.learning.success_model import SuccessModel
 from pycrorm_async.world.pose import Arms, Grasp
+from pycrorm_async.world.urdf import PR2
 
 AnyPolicy: TypeAlias = Policy | PolarPolicy | SuccessModel
 """All that chooses pick-ups: a tree of places, a tree of polar features, or a model of their success."""
 
 FORMAT = "pycrorm policy"
 VERSION = 3
+_OF_VERSION_1 = (None, PR2.name)
+"""The robots of trees of places whose files name none."""
 
 
 class _Heading(msgspec.Struct, frozen=True):
@@ -83,9 +87,10 @@ def save_policy(policy: AnyPolicy, path: Path | str) -> None:
     Raises `PolicyFileRefused` if the file cannot be written.
     """
     path, content = Path(path), encode_policy(policy)
-    version = 1 if isinstance(policy, Policy) else 2
-    if policy.robot is not None and not isinstance(policy, SuccessModel):
-        version = 3
+    if isinstance(policy, Policy):
+        version = 1 if policy.robot in _OF_VERSION_1 else 3
+    else:
+        version = 2 if policy.robot is None or isinstance(policy, SuccessModel) else 3
     heading = msgspec.json.encode(_Heading(FORMAT, version, zlib.crc32(content)))
     temporary = path.parent / f".{path.name}.{os.getpid()}"
     try:
@@ -112,7 +117,7 @@ def encode_policy(policy: AnyPolicy) -> bytes:
             policy.leaves,
             _encode_evidence(policy.evidence),
             policy.constant_height,
-            msgspec.UNSET if policy.robot is None else policy.robot,
+            msgspec.UNSET if policy.robot in _OF_VERSION_1 else policy.robot,
         )
     )
 
@@ -171,7 +176,7 @@ def decode_policy(encoded: bytes) -> AnyPolicy:
             height=evidence.height,
         ),
         content.constant_height,
-        content.robot or None,
+        content.robot or PR2.name,
     )
 
 

@@ -39,6 +39,7 @@ from pycrorm_async.learning.features import (
 )
 from pycrorm_async.learning.polar_policy import KINDS, PolarLeaf, PolarPolicy
 from pycrorm_async.learning.policy import ARMS, GRASPS, Floats, Leaf, Linear, Policy
+from pycrorm_async.world.urdf import PR2
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,10 +62,10 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
         successes: one row for each successful pick-up: `arm` and `grasp` as names; `robot_in_object_x` and
             `robot_in_object_y`, the position of the robot's base in the object's own frame, m, as in
             `PickUpWithContextView`, or under their former names `object_x` and `object_y`; optionally
-            `height`, the object's height minus the torso's, m, and `robot`, for which alone the policy is then used.
-            Other columns are ignored. If all heights are equal, the height is not learned but kept as the policy's
-            `constant_height`. Condition a policy that has learned heights on the present height, plus or minus 1 to
-            5 cm; unconditioned, it mixes the samples of all heights.
+            `height`, the object's height minus the torso's, m, and `robot`, for which alone the policy is then used; it is
+            the PR2 if it is not named. Other columns are ignored. If all heights are equal, the height is not learned
+            but kept as the policy's `constant_height`. Condition a policy that has learned heights on the present
+            height, plus or minus 1 to 5 cm; unconditioned, it mixes the samples of all heights.
         min_samples_leaf: minimum number of rows in a leaf, two or more. A smaller number makes the policy repeat its
             samples more exactly: its success rate rises and its coverage falls (see `Policy.coverage`).
 
@@ -92,7 +93,7 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
             columns[HEIGHT] = heights
     domains = {name: [each.name for each in members] for name, members in SYMBOLS.items()}
     leaves = (_leaf(weight, fitted) for weight, fitted in _fit(columns, domains, min_samples_leaf))
-    return Policy(tuple(leaves), constant_height=constant_height, robot=robot_of(successes))
+    return Policy(tuple(leaves), constant_height=constant_height, robot=robot_of(successes) or PR2.name)
 
 
 def learn_polar(successes: pd.DataFrame, *, min_samples_leaf: int = 20) -> PolarPolicy:

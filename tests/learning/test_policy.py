@@ -445,7 +445,7 @@ async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp
     assert (learned.training_episodes, learned.episode_count, learned.seeds) == ([str(training)], 1, [])
 
 
-OTHER = replace(default_policy(), constant_height=0.25)
+OTHER = replace(default_policy(), constant_height=0.25, robot="pr2")
 """A policy whose name is not that of the default one."""
 
 
@@ -470,6 +470,15 @@ async def test_the_policy_of_rollouts_is_read_back_after_its_file_was_overwritte
     assert [each.policy for each in batches] == [name_of(OTHER)] * 2
     assert (chosen, read, contents) == ({name_of(OTHER)}, OTHER, 1)
     assert picked == [name_of(OTHER)] * 4
+
+
+@pytest.mark.parametrize(("robot", "version", "read"), [(None, 1, "pr2"), ("pr2", 1, "pr2"), ("courier", 3, "courier")])
+def test_a_tree_of_places_is_read_back_for_the_robot_it_was_learned_for(
+    tmp_path: Path, robot: str | None, version: int, read: str
+) -> None:
+    save_policy(replace(OTHER, robot=robot), tmp_path / "policy.json")
+    assert f'"version":{version},' in (tmp_path / "policy.json").read_text()
+    assert load_policy(tmp_path / "policy.json") == replace(OTHER, robot=read)
 
 
 async def test_rollouts_with_one_arm_keep_the_name_of_the_policy_as_it_was_passed(tmp_path: Path) -> None:
