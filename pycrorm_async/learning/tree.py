@@ -62,10 +62,10 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
         successes: one row for each successful pick-up: `arm` and `grasp` as names; `robot_in_object_x` and
             `robot_in_object_y`, the position of the robot's base in the object's own frame, m, as in
             `PickUpWithContextView`, or under their former names `object_x` and `object_y`; optionally
-            `height`, the object's height minus the torso's, m, and `robot`, for which alone the policy is then used; it is
-            the PR2 if it is not named. Other columns are ignored. If all heights are equal, the height is not learned
-            but kept as the policy's `constant_height`. Condition a policy that has learned heights on the present
-            height, plus or minus 1 to 5 cm; unconditioned, it mixes the samples of all heights.
+            `height`, the object's height minus the torso's, m, and `robot`, the only one that the policy is then used
+            for, without it the PR2. Other columns are ignored. If all heights are equal, the height is not learned but
+            kept as the policy's `constant_height`. Condition a policy that has learned heights on the present height,
+            plus or minus 1 to 5 cm; unconditioned, it mixes the samples of all heights.
         min_samples_leaf: minimum number of rows in a leaf, two or more. A smaller number makes the policy repeat its
             samples more exactly: its success rate rises and its coverage falls (see `Policy.coverage`).
 
