@@ -153,7 +153,7 @@ class TransportPolicy:
         try:
             geometry.check_takable(robot, arm, obj)
             if collisions_count():
-                geometry.check_fits(robot, arm, obj, geometry.grasp_orientation(obj.pose, grasp))
+                geometry.check_fits(robot, arm, obj, geometry.grasping_pose(obj.pose, grasp))
         except failures.PlanFailure:
             return False
         return True

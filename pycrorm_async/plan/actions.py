@@ -146,7 +146,7 @@ class PickUpActionPerformable(CheckedAction):
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure: `arm` is not a single arm, or the object is furniture or a robot.
         CapabilityAbsenceFailure: the robot has no such arm; or the object is heavier than the arm's payload; or
-            collisions count, and the object is wider than the gripper's opening.
+            collisions count, and the object does not fit the gripper (`geometry.check_fits`).
     """
 
     concept: ClassVar[str | None] = "PickingUp"
@@ -163,7 +163,7 @@ class PickUpActionPerformable(CheckedAction):
         target = objects.in_world(self.object_designator)
         geometry.check_takable(robot, self.arm, target)
         if robot_motions.collisions_count():
-            geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, self.grasp))
+            geometry.check_fits(robot, self.arm, target, geometry.grasping_pose(target.pose, self.grasp))
         tool = robot.tool_pose(self.arm)
         before, at, above = geometry.pick_up_poses(robot.description, target.pose, self.grasp, tool)
         await robot_motions.MoveTCPMotion(
@@ -273,7 +273,7 @@ class GripActionPerformable(CheckedAction):
         IllPosedGoalFailure: `gripper` is not a single arm, the effort is below 0, or the object is furniture or a
             robot.
         CapabilityAbsenceFailure: the robot has no such arm; or the object is heavier than the arm's payload; or
-            collisions count, and the object is wider than the gripper's opening.
+            collisions count, and the object does not fit the gripper (`geometry.check_fits`).
     """
 
     concept: ClassVar[str | None] = "Holding"
@@ -299,7 +299,7 @@ class GripActionPerformable(CheckedAction):
             )
             raise failures.GripperClosedCompletely(message, target.name, distance)
         if robot_motions.collisions_count():
-            geometry.check_fits(robot, self.gripper, target, tool.orientation)
+            geometry.check_fits(robot, self.gripper, target, tool)
         await robot_motions.MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
         geometry.take(robot, self.gripper, target)
 
@@ -468,7 +468,7 @@ class TransportActionPerformable(CheckedAction):
         EndEffectorFailure: the arm holds another object.
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure, CapabilityAbsenceFailure: `arm` is not a single arm, or a gripper cannot hold the object;
-            the robot has no such arm, or collisions count and the object is wider than the gripper's opening.
+            the robot has no such arm, or collisions count and the object does not fit the gripper.
     """
 
     concept: ClassVar[str | None] = "Transporting"
@@ -489,7 +489,7 @@ class TransportActionPerformable(CheckedAction):
         is_held = robot.body.attachments.get(target) == tool_frame
         fetch = self._way.fetch if self._way is not None else None
         if robot_motions.collisions_count() and not is_held and fetch is None:
-            geometry.check_fits(robot, self.arm, target, geometry.grasp_orientation(target.pose, Grasp.FRONT))
+            geometry.check_fits(robot, self.arm, target, geometry.grasping_pose(target.pose, Grasp.FRONT))
         await self._park_arms()
         if not is_held:
             if fetch is not None:

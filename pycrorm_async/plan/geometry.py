@@ -11,6 +11,7 @@ from pycrorm_async.plan.objects import CurrentRobot, ObjectLike, ObjectPart, in_
 from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object
+from pycrorm_async.world.queries import collisions_at
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, ArmDescription, RobotDescription
 
 # === articulation =============================================================================================
@@ -193,7 +194,7 @@ def pick_up_poses(
     A PR2's approach follows the gripper's *current* direction, as in the thesis, that of other robots the direction
     which the gripper has at the object (`RobotDescription.approaches_along_fingers`).
     """
-    orientation = grasp_orientation(object_pose, grasp)
+    orientation = poses.product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
     along = orientation if description.approaches_along_fingers else tool.orientation
     back = poses.rotated(along, (-APPROACH_M, 0.0, 0.0))
     x, y, z = object_pose.position
@@ -205,9 +206,9 @@ def pick_up_poses(
     )
 
 
-def grasp_orientation(object_pose: poses.Pose, grasp: poses.Grasp) -> poses.Quaternion:
-    """Return the tool frame's orientation in a grasp of an object at this pose."""
-    return poses.product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
+def grasping_pose(object_pose: poses.Pose, grasp: poses.Grasp) -> poses.Pose:
+    """Return the tool frame's pose in a grasp of an object at this pose."""
+    return object_pose @ poses.Pose(orientation=GRASP_ORIENTATIONS[grasp])
 
 
 def place_pose(target: poses.Pose, held: poses.Pose, tool: poses.Pose) -> poses.Pose:
@@ -301,18 +302,29 @@ def check_free(robot: CurrentRobot, arm: poses.Arms, *but: Object) -> None:
             raise failures.EndEffectorFailure(f"the {arm.name} gripper holds {obj.name}: place or release it", obj.name)
 
 
-def check_fits(robot: CurrentRobot, arm: poses.Arms, target: Object, tool: poses.Quaternion) -> None:
-    """Raise `CapabilityAbsenceFailure` if the object is wider than the opening of a gripper with this orientation.
+def check_fits(robot: CurrentRobot, arm: poses.Arms, target: Object, tool: poses.Pose) -> None:
+    """Check that a gripper with its tool frame at this pose can take the object, and can leave it again.
 
-    The width, m, is that of the whole object along the direction in which the fingers close.
+    The fingers enclose the whole object: its width, m, is taken in the direction in which they close. Because a grasp
+    is at the object's middle, the palm may be in the object then. But the open gripper leaves it by moving back by
+    `RETRACT_M`: a short gripper that took a tall object from above would still be in it.
+
+    Raises:
+        CapabilityAbsenceFailure: the object is wider than the gripper's opening, or the gripper could not leave it.
     """
-    across = poses.Pose((0.0, 0.0, 0.0), tool).inverse()
+    body, described = robot.body, robot.one_arm(arm)
+    across = poses.Pose((0.0, 0.0, 0.0), tool.orientation).inverse()
     frames = [(across @ target.link_pose(link), target.body.solids[link]) for link in target.links]
     box = box_around([((frame.position, frame.orientation), solids) for frame, solids in frames])
-    width, opening = box.size.y if box is not None else 0.0, robot.one_arm(arm).opening_m
+    width, opening = box.size.y if box is not None else 0.0, described.opening_m
     if opening is not None and width > opening:
         message = f"{target.name} is {width:.3f} m wide between the fingers, the {arm.name} gripper opens {opening:g} m"
         raise failures.CapabilityAbsenceFailure(message, target.name, width, opening)
+    links = [each for each in body.links if body.body.solids[each] and described.joints[-1] in body.joints_above(each)]
+    base = retract(tool) @ body.pose.relative_to(robot.tool_pose(arm))
+    for link, obj in collisions_at(body, robot.gripper_joints(arm, poses.GripperState.OPEN), links=links, base=base):
+        if obj is target:
+            raise failures.CapabilityAbsenceFailure(f"{link} cannot move back out of {target.name}", target.name, link)
 
 
 def take(robot: CurrentRobot, arm: poses.Arms, target: Object) -> None:

@@ -733,8 +733,8 @@ class ChosenRobot:
         name: used in messages.
         modules: the robot's modules; a method of `ProcessModules` that they lack is a motion the robot cannot execute.
         limits: joint limits of its arms, used by searches that check reachability (`CostmapLocation`).
-        collisions: whether searches refuse places where its base would collide, and grippers refuse objects that are
-            wider than their opening.
+        collisions: whether searches refuse places where its base would collide, and grippers refuse objects that do
+            not fit them (`geometry.check_fits`).
     """
 
     def __init__(
@@ -769,7 +769,7 @@ def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> Chose
         collisions: whether a goal at which the arm or the held object collides raises `ManipulationGoalInCollision`,
             and one at which the base collides `NavigationGoalInCollision`. A motion may allow collisions of the
             gripper. Paths are not checked. Location designators then offer only places where the base, with its
-            heading, is clear, and a gripper refuses an object wider than its opening.
+            heading, is clear, and a gripper refuses an object that does not fit it (`geometry.check_fits`).
 
     >>> with simulated_robot_within(Limits.HARD):
     ...     await MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT).perform()

@@ -14,6 +14,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.transport import TransportPolicy
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.orm import TransportAction as TransportRow
 from pycrorm_async.plan import (
@@ -37,6 +38,7 @@ from pycrorm_async.plan import (
     SetGripperActionPerformable,
     SimulatedTaskTree,
     TransportActionPerformable,
+    geometry,
     simulated_robot,
 )
 from pycrorm_async.plan.failures import (
@@ -65,7 +67,7 @@ from pycrorm_async.world import (
     describe_robot,
     register_robot,
 )
-from pycrorm_async.world.models import built_in_model
+from pycrorm_async.world.models import box_urdf, built_in_model
 from pycrorm_async.world.pose import rotated, yaw_quaternion
 from tests.world.fakes import HEIGHT_M, RAILS, link_poses, rail_robot, raised_robot
 
@@ -422,3 +424,16 @@ async def test_a_gripper_of_a_tiago_pro_refuses_what_is_wider_than_its_pads_are_
     wide = PickUpActionPerformable(cereal, Arms.RIGHT, Grasp.LEFT)
     await fails(wide, "0.148 m wide between the fingers, the RIGHT gripper opens 0.079 m")
     await PickUpActionPerformable(cereal, Arms.RIGHT, Grasp.FRONT).perform()
+
+
+async def test_a_gripper_of_a_tiago_pro_refuses_a_grasp_that_it_could_not_leave(tables: Object) -> None:
+    """Its palm is 4 cm behind the middle of its fingers, and would still be in milk 0.2 m tall after moving back."""
+    milk, robot = tables.world.object("milk"), require_robot()
+    await NavigateActionPerformable(Pose([0.75, 0.1, 0])).perform()
+    from_above = PickUpActionPerformable(milk, Arms.LEFT, Grasp.TOP)
+    await fails(from_above, "gripper_left_base_link cannot move back out of milk")
+    assert [grasp for grasp in Grasp if TransportPolicy().takes(milk, Arms.LEFT, grasp)] == [
+        Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT,
+    ]  # fmt: skip
+    low = Object("low", ObjectType.GENERIC_OBJECT, box_urdf("low", x=(-0.03, 0.03), y=(-0.03, 0.03), z=(-0.06, 0.06)))
+    geometry.check_fits(robot, Arms.LEFT, low, geometry.grasping_pose(low.pose, Grasp.TOP))
