@@ -164,20 +164,15 @@ class PickUpActionPerformable(CheckedAction):
         geometry.check_takable(robot, self.arm, target)
         if robot_motions.collisions_count():
             geometry.check_fits(robot, self.arm, target, geometry.grasping_pose(target.pose, self.grasp))
-        tool = robot.tool_pose(self.arm)
+        arm, tool = self.arm, robot.tool_pose(self.arm)
         before, at, above = geometry.pick_up_poses(robot.description, target.pose, self.grasp, tool)
-        await robot_motions.MoveTCPMotion(
-            before, self.arm, allow_gripper_collision=True, _object_name=target.name
-        ).perform()
+        reach = partial(robot_motions.MoveTCPMotion, arm=arm, allow_gripper_collision=True, _object_name=target.name)
+        await reach(before).perform()
         await robot_motions.MoveGripperMotion(GripperState.OPEN, self.arm).perform()
-        await robot_motions.MoveTCPMotion(
-            at, self.arm, allow_gripper_collision=True, _object_name=target.name
-        ).perform()
+        await reach(at).perform()
         await robot_motions.MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
         geometry.take(robot, self.arm, target)
-        await robot_motions.MoveTCPMotion(
-            above, self.arm, allow_gripper_collision=True, _object_name=target.name
-        ).perform()
+        await reach(above).perform()
 
 
 @dataclass
