@@ -106,7 +106,7 @@ def test_a_robot_of_a_file_learns_and_the_memory_tells_it_from_others(
     mixed = one_line_of(pycrorm("learn", "--from-memory", cwd=tmp_path))
     assert "'pr2, simulated, soft limits'" in mixed
     assert "'scout, simulated, soft limits'" in mixed
-    robots = ask(tmp_path / "pycrorm.db", "SELECT DISTINCT robot FROM pick_up_with_context ORDER BY robot")
+    robots = ask(tmp_path / "pycrorm.db", 'SELECT DISTINCT robot FROM "PickUpWithContextView" ORDER BY robot')
     assert robots == [("pr2",), ("scout",)]
 
 

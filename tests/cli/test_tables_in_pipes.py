@@ -146,6 +146,7 @@ def test_the_number_of_recalled_actions_has_two_names(folder: Path) -> None:
 
 def test_the_text_of_a_status_and_of_the_questions_has_what_is_present(folder: Path) -> None:
     with Memory.sync(f"sqlite:///{folder / 'pycrorm.db'}") as memory:
+        memory.flush()  # the writer's thread drains from now on
         status, questions = repr(memory.status), repr(memory.ask)
     assert (status.startswith("MemoryStatus("), "drained=True" in status, "None" in status) == (True, True, False)
     assert "durations" in questions
