@@ -540,8 +540,8 @@ async def test_a_question_is_made_again_about_the_same_episodes_when_more_are_re
         for name, arguments in cases:
             exported = await export(reading, "durations", tmp_path / f"{name}.csv", arguments=arguments)
             assert exported.manifest.options == ({"arguments": {"episode": ID}} if arguments else {})
-        of_digits = reading.ask.durations(episode="0000")
-        assert await reading.rows(of_digits.statement) == await of_digits.rows() != []
+        of_digits = await reading.ask.durations(episode="0000").rows()
+        assert await reading.rows(reading.ask.durations(episode=ID).statement) == of_digits != []
         every = reading.ask.durations()
         await export(reading, every, tmp_path / "every.csv")
     script = Script(3)
