@@ -215,7 +215,7 @@ async def test_an_interrupted_rollout_does_not_count_and_is_repeated(
                 attempts += 1
                 stage.reset()
                 if attempts == 4:
-                    monkeypatch.setattr("pycrorm_async.plan.motions.solve", raising)
+                    monkeypatch.setattr("pycrorm_async.plan.motions.postures", raising)
 
             def raising(*_: object, **__: object) -> None:
                 raise Enough
