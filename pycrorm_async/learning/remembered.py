@@ -87,8 +87,8 @@ class RememberedPolicy:
 async def read_tries(reading: Reading) -> pd.DataFrame:
     """Return the pick-ups that succeeded or failed, without those of simulated episodes and of trials in the kitchen.
 
-    With such a trial `pycrorm learn` ends, in another world than that of its rollouts: what it tried is no reason to
-    ask which kind of pick-ups to learn from.
+    `pycrorm learn` ends with such a trial, in another world than that of its rollouts, so that the pick-ups of the
+    trial would be a second kind of experience.
 
     A pick-up at a chosen place (`MoveAndPickUpAction`) counts from its start on, also if the robot did not reach the
     place, and the frame has the place to which the robot was sent: of this one a policy must know the success. Of any

@@ -285,7 +285,10 @@ def _collision(
     *,
     grasps: bool,
 ) -> tuple[str, Object] | None:
-    """Return the first collision of the arm at goals with these postures each, as its motions will find it."""
+    """Return the collision at the first goal that the arm cannot be at without one, as its motions will find it.
+
+    `answers` has the postures of each goal.
+    """
     tool_frame = robot.description.arms[arm].tool_frame
     held = [] if grasps else [each for each, link in robot.body.attachments.items() if link == tool_frame]
     for each in answers:

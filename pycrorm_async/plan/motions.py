@@ -625,7 +625,10 @@ def clear_posture(
     held: Sequence[Object] = (),
     base: poses.Pose | None = None,
 ) -> dict[str, float] | tuple[str, Object]:
-    """Return the first of these postures, of which there is one, without an `arm_collision`, else that of the first."""
+    """Return the first of these postures at which the arm does not collide, or the first posture's collision.
+
+    There is at least one posture. A collision is returned as by `arm_collision`, if the arm collides at each of them.
+    """
     first: tuple[str, Object] | None = None
     for joints in answers:
         collision = arm_collision(robot, arm, joints, gripper_may_touch=gripper_may_touch, held=held, base=base)
