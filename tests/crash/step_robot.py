@@ -30,8 +30,9 @@ SETTINGS = Settings(
     spool_reserve_bytes=2**18,
     flush_timeout_s=60,
 )
-_PATIENT = replace(SETTINGS, connect_timeout_s=3600, flush_timeout_s=3600)
-"""Timeouts that no busy machine reaches: opening a database may take a minute there."""
+_PATIENT = replace(SETTINGS, connect_timeout_s=3600, flush_timeout_s=3600, keep_stored_s=0.0)
+"""Timeouts that no busy machine reaches: opening a database may take a minute there. Nothing is kept that is stored,
+because kept segments would refill what a drain has lost."""
 
 
 @dataclass
