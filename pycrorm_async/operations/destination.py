@@ -428,7 +428,8 @@ def stored_heads(spool: Path, log_id: str) -> dict[EpisodeId, int]:
         if progress is not None:
             stored = min(progress.drained().stored, progress.recorded().synced)
             progress.close()
-            for part in stored_records(StoredRecorder(recorder.name, _segments(recorder.path), over=False)):
+            segments = _segments(recorder.path) if stored else {}
+            for part in stored_records(StoredRecorder(recorder.name, segments, over=False)):
                 heads |= {each.episode: each.sequence for each in part if each.episode and each.position <= stored}
                 if part and part[-1].position >= stored:
                     break

@@ -328,15 +328,19 @@ def whole_frames(buffer: spool_format.Buffer, start: int, salt: int) -> Iterator
 
 
 def last_event(buffer: spool_format.Buffer, salt: int) -> spool_format.Frame | None:
-    """Search the segment from its end for the last whole frame with an event; None if it has no event."""
+    """Return the segment's last whole frame with an event; None if it has no event."""
+    return next((each for each in _last_frames(buffer, salt) if each.kind == spool_format.EVENT), None)
+
+
+def _last_frames(buffer: spool_format.Buffer, salt: int) -> Iterator[spool_format.Frame]:
+    """Find every frame of a segment, the last one first."""
     salted = spool_format.CHECKSUM.pack(salt)
     index = buffer.rfind(salted)
     while index >= 0:
         frame = spool_format.decode(buffer, index - _SALT_OFFSET, salt) if index >= _SALT_OFFSET else None
-        if frame is not None and frame.kind == spool_format.EVENT:
-            return frame
+        if frame is not None:
+            yield frame
         index = buffer.rfind(salted, 0, index + len(salted) - 1)
-    return None
 
 
 def _refuse_damage(folder: Path, recorder: bytes, prefix: ValidPrefix) -> None:
@@ -416,6 +420,8 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
 
     Leaves a damaged folder as it is, because a repair decides about its records.
     """
+    if _all_committed(folder, recorder):
+        return
     prefix, damage, uncommitted = survey(folder, recorder)
     if damage is not None or not uncommitted:
         return
@@ -424,6 +430,18 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
         if not all(is_whole(folder, each.hash) for each in references):
             seal(folder, prefix._replace(cut=before))
             return
+
+
+def _all_committed(folder: Path, recorder: bytes) -> bool:
+    """Return whether a commit frame covers the last whole record, so that the folder need not be surveyed."""
+    committed = 0
+    for number in reversed(spool_format.segment_numbers(folder)):
+        buffer = spool_format.read_segment(spool_format.segment_path(folder, number))
+        for frame in _last_frames(buffer, spool_format.salt_of(recorder, number)):
+            if frame.kind != spool_format.COMMIT:
+                return frame.position <= committed
+            committed = max(committed, frame.position)
+    return True
 
 
 def _frames_behind(

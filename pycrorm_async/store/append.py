@@ -38,7 +38,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DamageError, InternalError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1, SEQUENCE_MAX, EpisodeId, episode_text
-from pycrorm_async.events.types import Blob, BlobReference, references_in
+from pycrorm_async.events.types import REFERRING, Blob, BlobReference, references_in
 from pycrorm_async.store import schema
 from pycrorm_async.store import stored as storeds
 from pycrorm_async.store.dialect import DECLARATIONS, Dialect, Insertion, RowRefused
@@ -100,7 +100,7 @@ def sort(records: Iterable[Record]) -> SortedBatch:
 def step(records: Sequence[Record], row: storeds.EpisodeRow) -> EpisodeStep:
     """Compute the effect of these records, all of one episode, on its row."""
     first = records[0].sequence
-    if first == row.head + 1 and _consecutive(records) and _sound(records):
+    if first == row.head + 1 and _is_whole(records):
         return EpisodeStep(_advanced(row, records, refused=None), list(records))
     return _careful_step(records, row)
 
@@ -160,16 +160,15 @@ def _advanced(row: storeds.EpisodeRow, fresh: Sequence[Record], *, refused: str 
     return row._replace(head=last.sequence, ended_wall_ns=ended, refused=refused)
 
 
-def _consecutive(records: Sequence[Record]) -> bool:
-    first = records[0].sequence
-    return [record.sequence for record in records] == list(range(first, first + len(records)))
-
-
-def _sound(records: Sequence[Record]) -> bool:
-    return records[-1].sequence <= SEQUENCE_MAX and all(
-        _is_text(b"\n".join([each.payload for each in records[start : start + _CHECKED_AT_ONCE]]))
-        for start in range(0, len(records), _CHECKED_AT_ONCE)
-    )
+def _is_whole(records: Sequence[Record]) -> bool:
+    """Return whether nothing is missing between these records, and the log can hold all of them."""
+    for start in range(0, len(records), _CHECKED_AT_ONCE):
+        part, first = records[start : start + _CHECKED_AT_ONCE], records[0].sequence + start
+        if [each.sequence for each in part] != list(range(first, first + len(part))):
+            return False
+        if not _is_text(b"\n".join([each.payload for each in part])):
+            return False
+    return records[-1].sequence <= SEQUENCE_MAX
 
 
 def _is_text(payload: bytes) -> bool:
@@ -618,7 +617,7 @@ class Blobs:
 
         A blob that the source no longer has is reported and left out: waiting would not bring it back.
         """
-        referring = [each for each in records if b'"$blob"' in each.payload]
+        referring = [each for each in records if each.type in REFERRING and references_in(each.type, each.payload)]
         if referring and self.source is not None:
             async with self._reading() as connection:
                 removed = await removed_of(self._dialect, connection, {e.episode for e in referring if e.episode})
