@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Sequence
+from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import compress, product
@@ -86,8 +86,22 @@ class TransportPolicy:
     ) -> AsyncIterator[MoveAndPickUpPerformable]:
         """Iterate over ways to pick up the object so that it can be placed at the goal, the likeliest first.
 
-        After a failure, ways like the failed one count less.
+        After a failure, ways like the failed one count less. Once the object has moved, the ways start from its new
+        pose.
         """
+        obj, tried, has_moved = objects.in_world(target), list[PickUpChoice](), True
+        while has_moved:
+            has_moved, pose = False, obj.pose
+            async with aclosing(self._fetching_from_here(target, arms, goal, tried)) as ways:
+                async for way in ways:
+                    yield way
+                    if has_moved := obj.pose != pose:
+                        break
+
+    async def _fetching_from_here(
+        self, target: objects.ObjectLike, arms: Sequence[Arms], goal: Pose, tried: list[PickUpChoice]
+    ) -> AsyncGenerator[MoveAndPickUpPerformable, None]:
+        """Yield the ways for the object's present pose, and add them to those that were tried."""
         places = self.places(target, goal)
 
         @cache
@@ -108,7 +122,6 @@ class TransportPolicy:
         known = 0 if robot.description.approaches_along_fingers else 1  # of others the first depends on the base
         goals = [geometry.pick_up_poses(robot.description, obj.pose, grasp, Pose())[known:] for _, grasp in holds]
         weights: dict[int, float] = {}
-        tried: list[PickUpChoice] = []
         for _ in range(FETCHING_SEARCHES if holds else 0):
             ways = self.ways(self.stands(obj.pose, region=region), holds, goals, context)
             choices, hold_of = ways.choices, ways.holds
@@ -128,8 +141,8 @@ class TransportPolicy:
                     chances[hold_of == number] *= weights[number]
                 else:
                     chances[best] = 0.0
-                    yield action.way(choice)
                     tried.append(choice)
+                    yield action.way(choice)
                     chances *= 1 - likeness.to(choice) / 2
 
     def reaches(self, way: MoveAndPickUpPerformable, torso: float | None = None) -> bool:

@@ -38,7 +38,7 @@ from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.language import ActionAbstract, ActionDescription
 from pycrorm_async.plan.locations import CostmapLocation, Location, LocationDesignator
 from pycrorm_async.world.bullet import Object
-from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, yaw_quaternion
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, dot, yaw_quaternion
 from pycrorm_async.world.urdf import Drive
 
 # === basic ====================================================================================================
@@ -658,7 +658,8 @@ class TransportAction(ActionDescription[TransportActionPerformable]):
     """Fetch an object and place it at one of these poses.
 
     With a `policy`, `async for` and `Retry` get its ways to fetch the object with one of the arms, the likeliest first;
-    each alternative is another way, and delivers an object that an earlier one has picked up.
+    each alternative is another way, from where the object is by then, and delivers an object that an earlier one has
+    picked up. There are no more of them once the object is at its place.
 
     >>> ways = TransportPolicy(model)  # of pycrorm_async.learning
     >>> await Retry(TransportAction(milk, [Arms.LEFT, Arms.RIGHT], [place], policy=ways), max_tries=5).perform()
@@ -710,6 +711,8 @@ class TransportAction(ActionDescription[TransportActionPerformable]):
             async for each in self._chosen(self._policy, target, arms, goal):
                 offers = True
                 yield each
+                if _is_at(target, goal):
+                    return
         if not offers:
             names = ", ".join(each.name for each in among)
             message = f"there is no way to fetch {names} with which it can be placed at its goal"
@@ -719,26 +722,28 @@ class TransportAction(ActionDescription[TransportActionPerformable]):
         self, policy: TransportWays, target: objects.ObjectDesignator | Object, arms: Sequence[Arms], goal: Pose
     ) -> AsyncGenerator[TransportActionPerformable, None]:
         """Yield the ways to fetch one object for one place, and while it is held, to place it."""
-        places: dict[Arms, Iterator[Location | None]] = {}
-        exhausted: set[Arms] = set()
+        places: dict[tuple[Arms, Grasp | None], Iterator[Location | None]] = {}
+        exhausted: set[tuple[Arms | None, Grasp | None]] = set()
 
-        async def next_place(arm: Arms) -> Location | None:
-            if arm not in places:
-                places[arm] = policy.placing(target, arm, goal).steps()
-            for place in places[arm]:
+        async def next_place(arm: Arms, grasp: Grasp | None) -> Location | None:
+            if (hold := (arm, grasp)) not in places:
+                places[hold] = policy.placing(target, arm, goal).steps()
+            for place in places[hold]:
                 if place is not None:
                     return place
                 await asyncio.sleep(0)  # a search may take seconds
-            exhausted.add(arm)
+            exhausted.add(hold)
             return None
 
+        grasp: Grasp | None = None  # of an object that is held from the start the policy finds the grasp
         ways = policy.fetching(target, arms, goal)
-        while (arm := _holding(target)) not in exhausted:
+        while ((arm := _holding(target)), grasp) not in exhausted:
             way = await anext(ways, None) if arm is None else None
-            arm = arm if way is None else way.arm
+            if way is not None:
+                arm, grasp = way.arm, way.grasp
             if arm is None:
                 return
-            yield TransportActionPerformable(target, arm, goal, _Way(way, partial(next_place, arm)))
+            yield TransportActionPerformable(target, arm, goal, _Way(way, partial(next_place, arm, grasp)))
 
 
 def _holding(target: objects.ObjectDesignator | Object) -> Arms | None:
@@ -746,3 +751,10 @@ def _holding(target: objects.ObjectDesignator | Object) -> Arms | None:
     body, description = objects.require_robot()
     link = body.attachments.get(objects.in_world(target))
     return next((arm for arm, each in description.arms.items() if each.tool_frame == link), None)
+
+
+def _is_at(target: objects.ObjectDesignator | Object, goal: Pose) -> bool:
+    """Return whether no arm holds the object, and it is at the goal to 1 cm and 5°."""
+    pose = objects.in_world(target).pose
+    is_there = math.dist(pose.position, goal.position) < 0.01 and abs(dot(pose.orientation, goal.orientation)) > 0.999
+    return is_there and _holding(target) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import AsyncIterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning import Disturbance, SuccessModel, TransportPolicy, name_of
 from pycrorm_async.learning.move_and_pick_up import PredictedPickUpPerformable
+from pycrorm_async.learning.policy import PickUpChoice
 from pycrorm_async.learning.transport import held_grasp
 from pycrorm_async.orm import TransportAction as TransportRow
 from pycrorm_async.plan import (
@@ -26,6 +28,7 @@ from pycrorm_async.plan import (
     TransportAction,
     locations,
 )
+from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import ReachabilityFailure
 from pycrorm_async.plan.locations import Location, PlaceReach, face
 from pycrorm_async.plan.objects import require_robot
@@ -87,6 +90,82 @@ async def test_the_next_try_delivers_what_is_held_from_another_place() -> None:
                 break
         assert len(places) > 1
         assert len(set(places)) == len(places)
+
+
+async def test_ways_start_from_where_the_object_is_after_it_has_moved() -> None:
+    with tasks.kitchen(Disturbance()) as here:
+        for number in SOLVABLE:
+            thing, goal = here.prepare(69, number)
+            tries = aiter(TransportAction(thing, ARMS, [goal], policy=policy(number)))
+            await anext(tries)  # it fails, say, and pushes the object across the table
+            table = here.tables[0].pose
+            x, y, z = thing.pose.relative_to(table).position
+            thing.set_pose(table @ Pose((-x, y, z)))
+            await (await anext(tries)).perform()
+            np.testing.assert_allclose(thing.pose.position, goal.position, atol=1e-6)
+
+
+async def test_tries_before_an_object_moved_count_after_it() -> None:
+    class OnePlace(TransportPolicy):
+        """Fetches from one place with one height of the torso, with every arm and grasp alike; places from anywhere."""
+
+        def chances(self, choices: Sequence[PickUpChoice], _: Any) -> Any:
+            if len({each.grasp for each in choices}) == 1:
+                return np.ones(len(choices))
+            preferred.extend(choices[:1])
+            one = preferred[0]
+            off = [math.dist(each[2:4], one[2:4]) if each.torso == one.torso else math.inf for each in choices]
+            return np.where(np.array(off) < 0.07, 1.0, 0.01)
+
+    preferred: list[PickUpChoice] = []
+    holds = []
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 4)
+        async for way in OnePlace(checked=False, rng=np.random.default_rng(4)).fetching(thing, ARMS, goal):
+            holds.append((way.arm, way.grasp))
+            if len(holds) == 8:
+                break
+            thing.set_pose(thing.pose @ Pose((0.001, 0.0, 0.0)))
+    assert len(set(holds)) == 8
+
+
+async def test_there_is_no_further_try_once_the_object_is_at_its_goal() -> None:
+    tries = 0
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 4)
+        async for each in TransportAction(thing, ARMS, [goal, goal @ Pose((0.1, 0.0, 0.0))], policy=policy(4)):
+            tries += 1
+            await each.perform()
+    assert tries == 1
+
+
+async def test_an_object_that_was_dropped_is_placed_as_it_is_held_after_the_next_try() -> None:
+    class TwoGrasps(TransportPolicy):
+        """Fetches with one grasp and then with another; the only place for the first grasp is out of reach."""
+
+        async def fetching(self, target: Any, arms: Any, goal: Pose) -> AsyncIterator[MoveAndPickUpPerformable]:
+            grasps = set()
+            async for way in super().fetching(target, arms, goal):
+                if way.grasp not in grasps:
+                    grasps.add(way.grasp)
+                    yield way
+
+        def placing(self, held: Any, arm: Arms, goal: Pose) -> Any:
+            asked.append(held_grasp(require_robot(), arm, held))
+            return super().placing(held, arm, goal if len(asked) > 1 else Pose((0.0, 0.0, 3.0)))
+
+    asked: list[Grasp] = []
+    with tasks.kitchen(Disturbance()) as here:
+        thing, goal = here.prepare(69, 4)
+        start = thing.pose
+        tries = aiter(TransportAction(thing, [Arms.LEFT], [goal], policy=TwoGrasps(rng=np.random.default_rng(4))))
+        with pytest.raises(ReachabilityFailure, match="no other place to stand"):
+            await (await anext(tries)).perform()
+        here.robot.detach(thing)
+        thing.set_pose(start)
+        await (await anext(tries)).perform()
+        np.testing.assert_allclose(thing.pose.position, goal.position, atol=1e-6)
+    assert len(set(asked)) == 2
 
 
 async def test_the_only_place_is_found_with_the_torso_at_its_limit() -> None:
