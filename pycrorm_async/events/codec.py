@@ -169,6 +169,7 @@ class _Versioned(msgspec.Struct):
     version: int = 1
 
 
+_BACKSLASH: Final = ord("\\")
 _encoder = msgspec.json.Encoder()
 _decoder = Decoder(EVENT_TYPES, UPCASTERS)
 decode = _decoder.decode
@@ -188,8 +189,8 @@ def encode(event: Any, *, bytes_max: int = 2**20) -> bytes:
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise _first_fault(event) or NotEncodable("", str(error)) from None
     # The encoder writes NaN as null and U+0000 as an escape, so only payloads that hold one of these need a search.
-    # A search for one byte takes a third of the time of a search for six, and few payloads hold an escape.
-    if b"null" in payload or (b"\\" in payload and b"\\u0000" in payload):
+    # `in` with bytes tries first whether they are a number; a number is found soonest, and few payloads hold an escape.
+    if payload.find(b"null") >= 0 or (_BACKSLASH in payload and b"\\u0000" in payload):
         fault = _first_fault(event)
         if fault is not None:
             raise fault

@@ -484,7 +484,7 @@ class EpisodeCases:
         return None
 
     def _start(self, event: StoredEvent, started: event_types.NodeStarted, declaration_of: DeclarationOf) -> None:
-        number, sequence, _, _, wall_ns, monotonic_ns, payload = event
+        number, sequence, _, _, wall_ns, monotonic_ns, _ = event
         parent = started.parent
         scope = self._running.get(parent) or self._scopes.get(parent) if parent is not None else None
         fields = None
@@ -497,10 +497,11 @@ class EpisodeCases:
                 self._scopes[sequence] = scope
             return
         parameters = started.parameters
-        if b'"missing"' in payload:
-            parameters = {name: each for name, each in parameters.items() if not is_missing(each)}
-        if b'"pose_of"' in payload:
-            parameters = event_types.with_poses(parameters, self._poses_of)
+        for value in parameters.values():
+            if type(value) is dict and ("missing" in value or "pose_of" in value):
+                present = {name: each for name, each in parameters.items() if not is_missing(each)}
+                parameters = event_types.with_poses(present, self._poses_of)
+                break
         symbols, numbers = situation(fields, parameters, started.robot, self._world)
         after = self._after
         if scope is not None:

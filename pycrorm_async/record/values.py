@@ -213,7 +213,7 @@ def read_parameters(
     For each parameter that becomes a `MissingValue`, the function adds the reason to `missing`.
     """
     parameters: dict[str, Any] = {}
-    for name, read, encode, enum, *_ in fields:
+    for name, read, encode, enum, _, _ in fields:
         value: Any = None
         try:
             value = read(source)
@@ -304,9 +304,11 @@ def _encode_datetime(value: Any, _enum: type[Enum] | None, _references: Referenc
 def _encode_member(value: Any, enum: type[Enum] | None, references: References) -> str:
     if enum is None and isinstance(value, str) and not isinstance(value, Enum):
         return _encode_text(value, None, references)  # the name of a member of another executive's enum
-    if enum is not None and not isinstance(value, enum):
+    is_member = type(value) is enum  # the usual case; `isinstance` asks the class of the enum
+    if not is_member and enum is not None and not isinstance(value, enum):
         raise UnrecordableValue(f"{clean_repr(value)} is not a member of {enum.__name__}")
-    name = value._name_ if isinstance(value, Enum) else value.name  # `Enum.name` takes ten times as long
+    # `Enum.name` takes ten times as long.
+    name = value._name_ if is_member or isinstance(value, Enum) else value.name
     if not isinstance(name, str):
         raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {type(value).__name__}")
     writable: str = _require_writable(name)
@@ -337,9 +339,9 @@ def _encode_pose(value: Any, _enum: type[Enum] | None, references: References) -
 def _encode_object(
     value: Any, _enum: type[Enum] | None, references: References
 ) -> event_types.ObjectReference | event_types.ObjectValue:
-    if isinstance(value, event_types.ObjectReference | event_types.ObjectValue):
-        return value
     dtype: Any = recorded_as(type(value))
+    if dtype is None and isinstance(value, event_types.ObjectReference | event_types.ObjectValue):
+        return value
     if dtype is None or dtype == "pose":
         raise _mismatch("object designator", value)
     row = references.reference(value.row_of) if value.row_of is not None else None
