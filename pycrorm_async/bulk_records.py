@@ -1,7 +1,5 @@
 """Construct and keep many small records cheaply."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager

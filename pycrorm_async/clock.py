@@ -4,8 +4,6 @@ Each part that records gets its `Clock` as an argument, so that tests can pass o
 a memory read `SYSTEM_CLOCK`.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta

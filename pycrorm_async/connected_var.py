@@ -12,8 +12,6 @@ This is the package's only module state that is not a ContextVar. It keeps a val
 no value is connected and none was late, `get` is the ContextVar's own method and costs the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar, Token

@@ -5,8 +5,6 @@ database or the connection to it. `DamageError`: stored bytes that contradict th
 A plan that fails raises none of these, but `pycrorm_async.plan.PlanFailure`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

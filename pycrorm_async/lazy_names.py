@@ -6,8 +6,6 @@ next reading finds the name in the package.
 >>> __getattr__ = lazy_names(__name__, {"reading": "Reading memory_html", "success": "plot_success"})
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module

@@ -5,8 +5,6 @@
 `plan.motions.simulated_robot` can be imported although `plan.motions` is a module today.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Show a progress bar on stderr, with rate and remaining time; nothing if stderr is not a terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol

@@ -5,8 +5,6 @@ these names, and a log stores a declaration once only if old and new recorders w
 moves within the package keeps the name under which it was recorded first.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 _PACKAGE: Final = "pycrorm_async"

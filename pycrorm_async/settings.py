@@ -4,8 +4,6 @@
 50
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Status of a node of the task tree: one enumeration for plans, tables and queries."""
 
-from __future__ import annotations
-
 from enum import Enum
 
 

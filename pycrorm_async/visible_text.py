@@ -6,8 +6,6 @@ place that shows recorded text as text uses this function: the consoles of the c
 report; the page's scripts have the same rule (`plain` in `report/web/dom.js`). JSON has escapes of its own.
 """
 
-from __future__ import annotations
-
 import re
 
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")

@@ -3,8 +3,6 @@
 Panel: Ask, 1.
 """
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Callable

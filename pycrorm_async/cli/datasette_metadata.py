@@ -3,8 +3,6 @@
 Panel: Hand over, 3.
 """
 
-from __future__ import annotations
-
 from pycrorm_async.cli.output import JsonOption, print_json
 from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.export.export import datasette_metadata as describe

@@ -6,8 +6,6 @@ The robot parks its arms, raises its torso, finds a base pose, picks up the cere
 and puts the cereal there. The demo then runs five queries on the memory in plain Python.
 """
 
-from __future__ import annotations
-
 import asyncio
 import shlex
 from collections.abc import Sequence

@@ -10,8 +10,6 @@ Signal handlers run in the main thread between two bytecodes, so the handler may
 therefore writes its last line with one system call (`write_last`) and leaves with `os._exit`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

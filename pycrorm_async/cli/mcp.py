@@ -3,8 +3,6 @@
 Panel: Ask, 7.
 """
 
-from __future__ import annotations
-
 import asyncio
 
 from pycrorm_async.cli.reading import ReadingPlace

@@ -3,8 +3,6 @@
 Panel: Ask, 4.
 """
 
-from __future__ import annotations
-
 from pycrorm_async.cli.output import Form, moment, note, print_rows, print_table
 from pycrorm_async.cli.reading import ReadingPlace
 

@@ -3,8 +3,6 @@
 Panel: Operate, 6.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Sequence
 from dataclasses import asdict

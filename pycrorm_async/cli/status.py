@@ -3,8 +3,6 @@
 Panel: Operate, 1.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

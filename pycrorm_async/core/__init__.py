@@ -8,8 +8,6 @@ run the same with both.
 `PYCRORM_PURE=1` chooses Python. So does a Python without the interpreter lock, which the compiled core relies on.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import os

@@ -4,8 +4,6 @@ Hatchling runs the hook for each wheel, also for that of an editable install, wh
 `python pycrorm_async/core/build.py` compiles it there again after a change of the C file.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -24,8 +24,6 @@ Some code reads fields by key, without the shape, so these keep their place in e
 its version in them, under the key `version`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import sys

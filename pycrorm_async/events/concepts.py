@@ -7,8 +7,6 @@ counts as each of its named classes. Classes without a superclass here have one 
 ontology a *concept*. Two concepts of PyCRAM's designators are not in SOMA 2.1.0; this project chose their superclasses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -18,8 +18,6 @@ A mapped class also exposes the first pose field as `pose` and the first object 
 reserved for them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence

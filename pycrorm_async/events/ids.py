@@ -13,8 +13,6 @@ The rows of a list, such as the percepts of one detection, share an id and diffe
 assigns the episode *number* at the first append; it is valid in that database only.
 """
 
-from __future__ import annotations
-
 import uuid
 from typing import NamedTuple, NewType
 

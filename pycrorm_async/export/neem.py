@@ -18,8 +18,6 @@ objects of triples, and none over the values of annotations.
 | `meta.bson` | the description of the NEEM, as the hub has it |
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Iterable, Iterator, Mapping

@@ -5,8 +5,6 @@ ontology where newer ones have those of SOMA and DUL. Sources: the NEEM handbook
 SOMA 2.1.0 and the vocabulary of KnowRob (src/neems).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Final

@@ -6,8 +6,6 @@ of each joint that moves, `numbers/NAME` the numbers that were observed, `action
 A mesh is once in the file for each link that has it, and moves with the frame of the link.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial

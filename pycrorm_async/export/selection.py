@@ -4,8 +4,6 @@ Rows, also those that a question sums up, come from episodes that have ended and
 event, so that the same export can be made again. Those of a view are ordered by its key.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress

@@ -12,8 +12,6 @@ Encoding".
 What the formats have no place for is below the key `pycrorm`, so that an import gives the same nodes again.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path

@@ -8,8 +8,6 @@ own, because they are most of a bag.
 The memory that an import takes does not grow with the bag.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections import Counter

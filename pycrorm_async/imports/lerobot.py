@@ -11,8 +11,6 @@ and videos are left out.
 Only the rows of one episode are in memory at a time. Source: the description of the format in LeRobot's documentation.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -12,8 +12,6 @@ collection is the end of its name: `triples`, `tf`, `annotations`, `inferred`, `
 | JSON-LD | nodes with `@id`; terms and prefixes of its own `@context`, none of the web |
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import math

@@ -18,8 +18,6 @@ An import takes 75 MB for 100,000 nodes of one row of `ProcessMetaData`, because
 Facts: PyCRAM at 2024-07, `src/pycram/orm`.
 """
 
-from __future__ import annotations
-
 import re
 import sqlite3
 import sys

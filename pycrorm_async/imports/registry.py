@@ -8,8 +8,6 @@ A package adds a format with an entry point in the group `pycrorm.import_formats
 whose value is an `ImportFormat`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points

@@ -15,8 +15,6 @@ A message is an object with the fields of its type as attributes, as `rclpy` and
 `objects` names them. Frames above it, and the usual names of coordinate systems, connect. Others are objects.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct

@@ -7,8 +7,6 @@ A call of a tool is an action whose dtype is the name of the tool and whose para
 a language node; the outermost one has the input of the agent. A custom event is an observation of its run.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from operator import length_hint

@@ -1,7 +1,5 @@
 """A `ForeignPackage` is the library whose executive an integration records, with the versions it supports."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ by OTLP over HTTP in JSON, which needs no further package. A collector that is n
 read on before it has taken what was sent.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import os

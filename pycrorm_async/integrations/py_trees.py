@@ -4,8 +4,6 @@
 ...     tree.tick_tock(period_ms=20)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping
 from operator import attrgetter
 from typing import Any, Final

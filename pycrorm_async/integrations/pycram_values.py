@@ -1,7 +1,5 @@
 """Convert PyCRAM's plans and values into episodes and values of events."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import threading

@@ -6,8 +6,6 @@ that of `pycrorm import mcap`, so that a bag and the live system give the same e
 ROS installation, and is imported only when the node starts.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable

@@ -17,8 +17,6 @@ the name and version of the features they were learned with. A tree that names i
 holds the second line alone, as the content that the name of a policy is the hash of.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

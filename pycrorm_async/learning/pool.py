@@ -29,8 +29,6 @@ and stops the daemon last. Only one daemon drains a spool: while another holds i
 second and takes over when that one ends, so that a flush always has a daemon to wait for.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextvars
 import logging

@@ -6,8 +6,6 @@ to 127.0.0.1, is refused. `Origin` and `Sec-Fetch-Site`, which browsers add and 
 itself. The address has a token, which is compared in constant time; no cookie has it, so no other page can send it.
 """
 
-from __future__ import annotations
-
 import hmac
 import os
 import re

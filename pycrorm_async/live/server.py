@@ -9,8 +9,6 @@ A page has the events up to its loading, and its stream brings the rest in parts
 is its last event, so a browser that lost the connection continues behind it, also with a server started again.
 """
 
-from __future__ import annotations
-
 import asyncio
 import html
 import math

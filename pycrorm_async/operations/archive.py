@@ -7,8 +7,6 @@ the two leaves the episode in both, and the next archive finds it in the lake an
 the commit leaves files that the catalog does not know; an hour later the next archive or erasure deletes them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from itertools import islice

@@ -13,8 +13,6 @@ from a folder before the database has confirmed it. If the SQLite file is replac
 daemon stops, because it would keep writing to the old file, which no longer has a name.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 from collections.abc import Callable, Collection, Sequence

@@ -16,8 +16,6 @@ A spool that appends new episodes before another spool has healed may get number
 then get new numbers, and their row ids change. No number is given to two episodes.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket

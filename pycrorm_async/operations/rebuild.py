@@ -1,7 +1,5 @@
 """`pycrorm rebuild`: run one rebuild from start to end, by one process or several."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import multiprocessing

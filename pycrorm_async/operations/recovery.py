@@ -4,8 +4,6 @@ The folders of dead recorders are drained into the log, folded and deleted. Thos
 drains are drained as far as they are synced, and stay.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack

@@ -16,8 +16,6 @@ On PostgreSQL the tables may belong to another role, whose code must not run wit
 then removes only the events; the same command, run by a login of that role, removes the rows of the tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime

@@ -8,8 +8,6 @@ What a rule removes, the journal (`pycrorm_removed_episode`) names with the rule
 `operations.archive` moves it into a lake.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence

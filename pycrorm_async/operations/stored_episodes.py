@@ -3,8 +3,6 @@
 A recording has no event loop of its own and may be called inside one, so each question runs in a thread of its own.
 """
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import time

@@ -24,8 +24,6 @@ The process is a new interpreter. A fork would copy locks whose owning threads d
 `multiprocessing` would import the plan's main module and so perform again a plan that stands there unguarded.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import os

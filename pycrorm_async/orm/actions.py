@@ -11,8 +11,6 @@ Each expression is a node of the task tree, and the nodes of its operands are it
 >>> interrupted = select(Monitor).join(Monitor.node).where(TaskTreeNode.status == TaskStatus.INTERRUPTED)
 """
 
-from __future__ import annotations
-
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, synonym
 

@@ -5,8 +5,6 @@ and from its type: times are integers in SQL, so their text has their unit. Run 
 the built-in tables and the comments on their views, `projections/schema.json`, from these classes.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

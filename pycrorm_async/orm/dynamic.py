@@ -14,8 +14,6 @@ polymorphic identity of its own, and only the engines of its memory map rows to 
 their objects, because objects may outlive the memory, which unmaps their classes when it is closed.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType

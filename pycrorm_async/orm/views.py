@@ -1,7 +1,5 @@
 """Map the built-in views of pick-ups, failures and spatial relations."""
 
-from __future__ import annotations
-
 from datetime import datetime
 
 from sqlalchemy import ForeignKey

@@ -19,8 +19,6 @@ Descriptions with alternatives are in `actions`.
 >>> await TransportActionPerformable(milk, Arms.LEFT, Pose([1.3, 0.6, 0.95])).perform()
 """
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import math

@@ -5,8 +5,6 @@ performs its alternatives in the order of their chances, asks again after each f
 adviser does not allow. Where the adviser has no answer, the alternatives keep their own order.
 """
 
-from __future__ import annotations
-
 from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Sequence
 from contextlib import aclosing
 from contextvars import ContextVar

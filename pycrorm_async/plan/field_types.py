@@ -4,8 +4,6 @@ Classes, unions and None in a union are checked, and the items of lists and dict
 declared. An annotation that cannot be evaluated, such as a class local to a function, is not checked.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import numbers

@@ -1,7 +1,5 @@
 """Compute poses for grasping, opening and holding, and check whether a gripper can take an object."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

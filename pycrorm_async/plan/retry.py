@@ -12,8 +12,6 @@ resolved inside. A world `Object` used directly still belongs to the original wo
 A memory records a simulation as an episode of its own, which ordinary queries leave out.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import operator

@@ -4,8 +4,6 @@ Plans that never suspend need the evaluation before each node, because no other 
 once, so that it does not interrupt the cleanup of the interrupted plan.
 """
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import inspect

@@ -6,8 +6,6 @@
 ('zz_pose__1001', 'zz_pose__1001_by_time')
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache

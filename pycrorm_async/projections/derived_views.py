@@ -14,8 +14,6 @@ the map around it. With the box A around the picked up or placed object and anot
     next to  neither, their horizontal gap is at most `NEXT_TO_M`, and their heights overlap; not for environments
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Turn events into rows, without reading a table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import ParseError, fromstring

@@ -21,8 +21,6 @@ own, in which the whole machine may have been stopped, it measures a part.
 SQLite has one writer at a time, and no group.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import AsyncIterator, Mapping

@@ -20,8 +20,6 @@ killed therefore leaves either the old or the new state. A row under `making` is
 resume, and a row under `gone` all that it needs to drop the tables.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager

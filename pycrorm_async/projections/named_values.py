@@ -6,8 +6,6 @@ the batch or before it; those before it are looked up in the log by primary key,
 needs none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 

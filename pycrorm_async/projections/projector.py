@@ -5,8 +5,6 @@ await projector.open()
 await projector.catch_up()
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import replace

@@ -23,8 +23,6 @@ Queries that began before the switch may still read the replaced tables. The swi
 the section "replaced tables" waits some seconds for such queries, and reports tables that are still in use.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager

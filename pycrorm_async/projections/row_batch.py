@@ -4,8 +4,6 @@ A node that starts and ends in one batch is one row to insert. Rows are tuples i
 the batch is complete later events change the rows of nodes and episodes, which are lists and dicts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from operator import itemgetter

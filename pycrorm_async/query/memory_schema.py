@@ -5,8 +5,6 @@ print(as_text(schema))
 print(as_mermaid(schema))       # a diagram, which GitHub, GitLab, Obsidian and mermaid.live draw
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ references, `kind_of` says what a content can be shown as, and the others read i
 `ValueError` with the reason. Pillow is needed only to make a large encoded image smaller.
 """
 
-from __future__ import annotations
-
 import asyncio
 import io
 import struct

@@ -3,8 +3,6 @@
 The world is made in a thread with an empty context, so that it belongs to no open episode and is not recorded.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Collection, Sequence

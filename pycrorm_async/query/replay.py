@@ -7,8 +7,6 @@ makes rows, and its state is a batch of them.
 A replay is pure, and its memory grows with the state that it has.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 `pycrorm status` asks nothing else of the tables, and mapping the classes would take half of its time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime

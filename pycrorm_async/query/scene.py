@@ -1,7 +1,5 @@
 """Read the recorded geometry of a moment without Bullet: shapes of objects, poses of links, outlines from above."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple

@@ -5,8 +5,6 @@ The parent writes one request to stdin, (URI of the file, SQL, bytes of rows, se
 message. All messages are marshalled values. This program imports nothing of the package, so that it starts in 20 ms.
 """
 
-from __future__ import annotations
-
 import marshal
 import resource
 import sqlite3

@@ -1,7 +1,5 @@
 """Format recorded values as one line of text or as HTML, and find the nearest names."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ A file gets its name when its content is complete, and is never changed. A kill 
 power cut may leave a file whose content is not on the disk: readers compare the content with the name.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Callable, Iterable

@@ -23,8 +23,6 @@ compiled core appends without this lock, in one step that no thread, finalizer o
 between at which the collector is on; `resume_gc` hands it back.
 """
 
-from __future__ import annotations
-
 import gc
 import threading
 from collections.abc import Callable

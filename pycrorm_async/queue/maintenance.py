@@ -1,7 +1,5 @@
 """Inspect a spool, and repair a damaged recorder's folder."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections import Counter

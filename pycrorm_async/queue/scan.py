@@ -18,8 +18,6 @@ Scanning changes no file. `seal` truncates the files at the cut and first copies
 `sync_segments` makes the kept segments durable before their records are passed on.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path

@@ -11,8 +11,6 @@ Kept segments duplicate records of the database, so they must not compete with r
 deleted, oldest first, after `keep_stored_s`, above `keep_stored_bytes`, above `FILES_MAX`, and when the disk is full.
 """
 
-from __future__ import annotations
-
 import logging
 import mmap
 import os

@@ -11,8 +11,6 @@ taken for ever, and the plan's next event would hang. `SimpleQueue.put` is reent
 producer may call it under the queue's lock, and so may a finalizer.
 """
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable

@@ -8,8 +8,6 @@ Rate(share=0.55, low=0.34, high=0.74, successes=11, tries=20)
 >>> print(answer[0].why())
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

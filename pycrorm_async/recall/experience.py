@@ -15,8 +15,6 @@ does not outrank many successes with a few failures. A way that succeeded at ano
 this one, and its score is near the prior.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple, Self, TypeAlias

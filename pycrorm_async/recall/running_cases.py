@@ -8,8 +8,6 @@ soon as it is known. Start and duration of such a case are those at which its ev
 later than those in the log; the reader takes the stored case as soon as there is one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field

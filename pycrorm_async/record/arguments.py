@@ -1,7 +1,5 @@
 """Copy the arguments of an executive: descriptions of objects, and values through its own conversion."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from enum import Enum

@@ -7,8 +7,6 @@ interpreter for the plan meanwhile. Images take at most half of the spool, so th
 them.
 """
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import AsyncIterable, Callable

@@ -5,8 +5,6 @@ given. The monotonic time of an episode never goes back, because durations and t
 it: an event that is given an earlier time happens, by this clock, with the event before it.
 """
 
-from __future__ import annotations
-
 import operator
 from typing import Any, NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """`FramePlaces` knows where frames are, so that a pose in one of them is recorded in the map."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from msgspec.structs import replace

@@ -4,8 +4,6 @@ A description is parsed, hashed and compressed once, and again only when a mesh 
 further object the plan pays for a lookup, and for a `stat` of each mesh file.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import os

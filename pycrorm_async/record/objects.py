@@ -8,8 +8,6 @@ keeps its former row. An object whose `ObjectAdded` failed has no row, and its l
 an event that names an object without a row would be damage.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from sys import intern

@@ -8,8 +8,6 @@ with the next sequence. An executive must report the same again; an event of ano
 that the source has changed, and ends the recording. The times at which values of poses were created are not compared.
 """
 
-from __future__ import annotations
-
 import re
 from collections import deque
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """`Recording` writes the episodes of any executive into a memory, from any thread and without asyncio."""
 
-from __future__ import annotations
-
 import builtins
 import threading
 from collections.abc import Iterable, Mapping, Sequence

@@ -8,8 +8,6 @@ A block is written when it is full, when it spans `_SPAN_NS`, and at the end of 
 in the memory of the process only.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, Final

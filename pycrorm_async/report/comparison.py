@@ -4,8 +4,6 @@
 PosixPath('diff.html')
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Sequence
 from os import PathLike

@@ -1,7 +1,5 @@
 """Give a file or a folder its name only when it is complete and on the disk, so that no reader finds a part of it."""
 
-from __future__ import annotations
-
 import fcntl
 import glob
 import os

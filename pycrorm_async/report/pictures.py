@@ -4,8 +4,6 @@ A page has at most 200 thumbnails and 20 point clouds, chosen evenly over the ep
 counted. Contents are stored once, by their hash.
 """
 
-from __future__ import annotations
-
 import asyncio
 from base64 import b64encode
 from collections.abc import Mapping, Sequence

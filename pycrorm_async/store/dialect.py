@@ -1,7 +1,5 @@
 """Define the operations that differ between databases; `store.sqlite` and `store.postgresql` implement them."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

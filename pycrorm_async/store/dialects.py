@@ -1,7 +1,5 @@
 """Find the dialect of a connection or an engine."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine

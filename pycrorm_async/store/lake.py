@@ -11,8 +11,6 @@ too, so those of payloads are cleared: otherwise they would outlive an erased ep
 
 # ruff: noqa: S608 - the SQL is composed of names and of paths that the caller gave
 
-from __future__ import annotations
-
 import logging
 import math
 import sqlite3

@@ -31,8 +31,6 @@ rate. All readers trust the folders, whose views they read.
 
 # ruff: noqa: S608 - the SQL is composed of names only; every value is a parameter
 
-from __future__ import annotations
-
 import logging
 from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager

@@ -2,8 +2,6 @@
 
 # ruff: noqa: S608 - the SQL is composed of our own schema names only
 
-from __future__ import annotations
-
 import os
 from functools import partial
 from typing import Any

@@ -3,8 +3,6 @@
 Only code that has opened a server imports this module, because the server's driver takes a tenth of a second to load.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re

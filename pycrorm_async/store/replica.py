@@ -14,8 +14,6 @@ does not answer, or follows no server any more, the primary does, and while the 
 does.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from datetime import datetime

@@ -8,8 +8,6 @@ The tables are those of format 1, with which the steps of `Dialect.migrations` b
 are not part of the format: they are created when they are first needed, and older programs still use the log.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Final
 

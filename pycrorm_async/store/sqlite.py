@@ -8,8 +8,6 @@ payloads keep the bytes of the queue.
 
 # ruff: noqa: S608 - the SQL is composed of names only; every value is a parameter
 
-from __future__ import annotations
-
 import asyncio
 import sqlite3
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence

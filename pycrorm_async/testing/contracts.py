@@ -4,8 +4,6 @@ rows = await check_projection(GraspRate(), plan, tmp_path)
 assert [row["arm"] for row in rows["grasp_try"]] == ["LEFT"]
 """
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import inspect

@@ -1,7 +1,5 @@
 """A clock that advances only when a test advances it."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 from pycrorm_async.clock import Clock

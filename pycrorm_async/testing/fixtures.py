@@ -9,8 +9,6 @@ async def test_a_greeting_is_recorded(memory):
     await memory.flush()
 """
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator
 from pathlib import Path
 

@@ -9,8 +9,6 @@ the root follows from the base's pose and the joints between them, so pose and j
 joint above the base moves the base, and the root keeps its pose.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass

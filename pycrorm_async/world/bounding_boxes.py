@@ -3,8 +3,6 @@
 They are exact; a mesh has the box around its vertices.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from contextlib import suppress

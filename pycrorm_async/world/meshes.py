@@ -4,8 +4,6 @@ Vertices are in m and with the z axis up, as far as a file says otherwise; mater
 read raises `ValueError` with the reason.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -1,7 +1,5 @@
 """Compute the boxes around the links of a model, and put them in the place of meshes."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import PurePath

@@ -24,8 +24,6 @@ in the middle of its top face; a handle's frame is in its middle with x pointing
 approaching from the front has the handle's orientation. A drawer or door at joint position 0 is closed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial

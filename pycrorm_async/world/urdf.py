@@ -16,8 +16,6 @@ its description, and an action that needs it fails with `CapabilityAbsenceFailur
 >>> PANDA = describe_robot("panda", path, srdf=srdf_path, park="default", drive=Drive.FIXED)
 """
 
-from __future__ import annotations
-
 import itertools
 import logging
 import math

@@ -12,8 +12,6 @@ known. A continuous joint is endless whatever its <limit> says; <limit> without 
 has length one. A floating or planar joint does not move.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

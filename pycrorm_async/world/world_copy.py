@@ -21,8 +21,6 @@ move a robot of its own.
 ...     await asyncio.gather(tidy(ada, Pose([1, 0, 0])), tidy(bob, Pose([-1, 0, 0])))
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar

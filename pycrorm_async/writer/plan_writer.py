@@ -4,8 +4,6 @@ Appending runs beside the plan. Folding takes interpreter time from it, so it wa
 end.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -11,8 +11,6 @@ PYCRORM_ENGINE, and `BulletWorld(engine=)` before it, name another one. No other
 ...     Object("bowl", ObjectType.BOWL)
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

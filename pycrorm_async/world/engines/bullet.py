@@ -6,8 +6,6 @@ of mass in the origins of their links, because it computes the frames of these c
 Bullet makes the hulls of meshes 1 mm thicker, and rounds the corners of boxes by as much.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os
