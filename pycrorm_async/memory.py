@@ -34,7 +34,6 @@ from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanag
 from contextvars import copy_context
 from dataclasses import replace
 from functools import partial, wraps
-from os import PathLike
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, cast
@@ -559,7 +558,7 @@ class Memory:
     async def report(
         self,
         episode: AskedEpisode,
-        path: str | PathLike[str] | None = None,
+        path: str | os.PathLike[str] | None = None,
         *,
         force: bool = False,
         first: int | None = None,
@@ -583,7 +582,7 @@ class Memory:
     async def export(
         self,
         what: Exportable | SyncQuestion,
-        path: str | PathLike[str],
+        path: str | os.PathLike[str],
         *,
         file_format: FileFormat | None = None,
         episodes: Sequence[str | int] = (),
@@ -611,8 +610,8 @@ class Memory:
 
     async def export_again(
         self,
-        manifest: str | PathLike[str],
-        path: str | PathLike[str] | None = None,
+        manifest: str | os.PathLike[str],
+        path: str | os.PathLike[str] | None = None,
         *,
         statement: Question | Select[*tuple[Any, ...]] | None = None,
         force: bool = False,

@@ -11,7 +11,6 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 from pycrorm_async.plan.failures import ResolutionError
@@ -111,7 +110,7 @@ def record_arguments(initialise: Callable[..., None]) -> Callable[..., None]:
         initialise(self, *arguments, **options)
         bound = signature.bind(self, *arguments, **options)
         bound.apply_defaults()
-        namespace = self.__dict__.setdefault(ARGUMENTS, SimpleNamespace()).__dict__
+        namespace = self.__dict__.setdefault(ARGUMENTS, types.SimpleNamespace()).__dict__
         _, *values = bound.arguments.items()
         namespace.update((name, value if value or name not in variadic else None) for name, value in values)
 

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar, 
 
 import msgspec
 import sqlalchemy as sa
-from sqlalchemy import ColumnElement
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.ext.hybrid import HybridExtensionType
 from sqlalchemy.orm import Mapper
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
 #
 # Define the SQL expressions that several questions select or filter by.
 
-EpisodeNumber: TypeAlias = "int | ColumnElement[int] | Sequence[int]"
+EpisodeNumber: TypeAlias = "int | sa.ColumnElement[int] | Sequence[int]"
 """The number of an episode, an expression that finds it, or the numbers of several."""
 
 E = TypeVar("E", bound=EnumMember)
@@ -65,7 +64,7 @@ NORMAL_95 = 1.959964
 """95 % of a normal distribution are within this many standard deviations."""
 
 
-def of_episode(column: Any, episode: Any) -> ColumnElement[bool]:
+def of_episode(column: Any, episode: Any) -> sa.ColumnElement[bool]:
     """Return the condition that a row is of an episode, or of one of several, by the column of their numbers.
 
     `episode` is an `EpisodeNumber`; for None every row fulfils the condition. Several are ranges, because most numbers
@@ -74,7 +73,7 @@ def of_episode(column: Any, episode: Any) -> ColumnElement[bool]:
     if episode is None:
         return sa.true()
     if not isinstance(episode, Sequence):
-        same: ColumnElement[bool] = column == episode
+        same: sa.ColumnElement[bool] = column == episode
         return same
     ranges: list[list[int]] = []
     for number in sorted(episode):
@@ -87,28 +86,28 @@ def of_episode(column: Any, episode: Any) -> ColumnElement[bool]:
     )
 
 
-def equal(column: Any, value: Any) -> ColumnElement[bool]:
+def equal(column: Any, value: Any) -> sa.ColumnElement[bool]:
     """Return the condition that the column has this value; for None every row fulfils it."""
-    same: ColumnElement[bool] = sa.true() if value is None else column == value
+    same: sa.ColumnElement[bool] = sa.true() if value is None else column == value
     return same
 
 
-def needed(*conditions: ColumnElement[bool]) -> list[ColumnElement[bool]]:
+def needed(*conditions: sa.ColumnElement[bool]) -> list[sa.ColumnElement[bool]]:
     """Return the conditions without those that every row fulfils, for a select that may have no others."""
     return [each for each in conditions if not isinstance(each, sa.True_)]
 
 
-def json_text(document: Any, name: str) -> ColumnElement[str]:
+def json_text(document: Any, name: str) -> sa.ColumnElement[str]:
     """Return the member of this name of a column of JSON as text; SQLite alone would return a number as a number."""
     return sa.cast(member(document, name), sa.Text)
 
 
-def times_with(condition: Any) -> ColumnElement[int]:
+def times_with(condition: Any) -> sa.ColumnElement[int]:
     """Return the number of rows of a group that fulfil the condition."""
     return sa.cast(sa.func.coalesce(sa.func.sum(sa.case((condition, 1), else_=0)), 0), sa.Integer)
 
 
-def success_rate(status: Any, among: Any) -> tuple[ColumnElement[float], ...]:
+def success_rate(status: Any, among: Any) -> tuple[sa.ColumnElement[float], ...]:
     """Return share, low and high: the share of successes in a group, and its 95 % interval by Wilson's score.
 
     Only rows that fulfil `among` count; all three are null without one. `query.success.interval_95` computes the same.
@@ -123,7 +122,7 @@ def success_rate(status: Any, among: Any) -> tuple[ColumnElement[float], ...]:
     return tuple(sa.cast(value, sa.Double).label(name) for name, value in rate)
 
 
-def containing(text: str, *columns: Any) -> ColumnElement[bool]:
+def containing(text: str, *columns: Any) -> sa.ColumnElement[bool]:
     """Return the condition that one of the columns contains the text, in upper or lower case; see `is_named`."""
     escaped = re.sub("[/%_]", r"/\g<0>", text)
     return sa.or_(
@@ -134,7 +133,7 @@ def containing(text: str, *columns: Any) -> ColumnElement[bool]:
     )
 
 
-def is_named(column: Any, name: str) -> ColumnElement[bool]:
+def is_named(column: Any, name: str) -> sa.ColumnElement[bool]:
     """Return the condition that the column is this name, in upper or lower case.
 
     The database lowers both, because its rule for letters differs from Python's: SQLite lowers only A to Z, so that

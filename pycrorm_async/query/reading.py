@@ -22,7 +22,6 @@ from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from shlex import quote
-from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar, overload
 from weakref import ref
 
@@ -688,7 +687,7 @@ class LoadOnAccess:
     def __init__(self, engine: AsyncEngine, translated: Callable[[], AbstractContextManager[None]]) -> None:
         self.engine = engine
         self._translated = translated
-        self._lock = Lock()
+        self._lock = threading.Lock()
         self._connection: ContextVar[sa.Connection | None] = ContextVar("connection_of_load", default=None)
 
     @property

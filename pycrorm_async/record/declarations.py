@@ -16,7 +16,6 @@ from datetime import datetime
 from enum import Enum
 from functools import partial
 from operator import itemgetter
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 from pycrorm_async.events import fields as event_fields
@@ -54,7 +53,7 @@ class DeclaredType(NamedTuple):
     fingerprint: str
     fields: tuple[Field, ...]
     declaration: event_types.DesignatorTypeDeclared
-    undeclared: Mapping[str, str] = MappingProxyType({})
+    undeclared: Mapping[str, str] = types.MappingProxyType({})
     fault: str | None = None
 
 

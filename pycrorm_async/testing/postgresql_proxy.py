@@ -17,7 +17,6 @@ import socket
 import struct
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -245,7 +244,7 @@ class _Link:
             await self.client[1].drain()
 
 
-@asynccontextmanager
+@contextlib.asynccontextmanager
 async def proxy_before(socket_folder: Path) -> AsyncIterator[Proxy]:
     """Run a proxy, in the running loop, before the PostgreSQL server whose Unix socket is in this folder."""
     proxy = Proxy(socket_folder / ".s.PGSQL.5432")
