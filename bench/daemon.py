@@ -8,11 +8,12 @@ The recorders record everything before the daemon starts, so the daemon runs at 
 JSON line: events a second until the last one is stored, and until the last one is visible in the tables.
 
 On PostgreSQL 1, 2 and 8 daemons, each with a recorder and a spool of its own, then drain as many events into one
-database, in turn for `--rounds` rounds. The line has, for each number of daemons, the processor time of an event in µs
-in the daemons with their fold workers and in the server, the time until all is visible, and the reads of an event in
-the log: the least of the rounds. `rate_by_cpu` and `rate_by_wall` are the rates as multiples of that of the first
-number. Where other programs use the machine, only the processor time says how the rates would be on an idle one,
-on which the daemons and the server use all cores.
+database, in turn for `--rounds` rounds. Each daemon has drained 25,000 events before: its fold workers have opened the
+database and folded a large batch, as those of a daemon that has run for a while. The line has, for each number of
+daemons, the processor time of an event in µs in the daemons with their fold workers and in the server, the time until
+all is visible, and the reads of an event in the log: the least of the rounds. `rate_by_cpu` and `rate_by_wall` are the
+rates as multiples of that of the first number. Where other programs use the machine, only the processor time says how
+the rates would be on an idle one, on which the daemons and the server use all cores.
 """
 
 import argparse
@@ -35,7 +36,8 @@ from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
 from tests.databases import Server, ask, server_in
 
-WARM_UP = 5_000
+WARM_UP = 25_000
+"""Events of each daemon that are not measured: a batch of 10,000 for each of its two fold workers, and some more."""
 READ = "SELECT idx_tup_fetch + seq_tup_read FROM pg_stat_user_tables WHERE relname = 'event'"
 
 
@@ -108,22 +110,14 @@ async def drain_by(server: Server, folder: Path, daemons: int, events: int) -> C
     started = [start_daemon(url, each) for each in spools]
     async with AsyncExitStack() as stack:
         memories = [await stack.enter_async_context(Memory.open(url, spool=each, writer="daemon")) for each in spools]
-        for memory in memories:
-            await record(memory, WARM_UP)
-            await memory.flush()  # starts all fold workers and makes the tables, which are not measured
-        for each in started:
-            each.send_signal(signal.SIGSTOP)
+        await fill(started, memories, WARM_UP)
+        await drained(started, memories)
         before, reads = sum(memory.status.written for memory in memories), await counted_reads(url)
-        for memory in memories:
-            await record(memory, before // daemons + events // daemons)
-            await memory.synced()
+        await fill(started, memories, events // daemons)
         total = sum(memory.status.written for memory in memories)
         began_s, daemons_s = time.perf_counter(), sum(processor_s(each.pid) for each in started)
         server_s = processor_s(server.postmaster.pid)
-        for each in started:
-            each.send_signal(signal.SIGCONT)
-        while sum(memory.status.folded or 0 for memory in memories) < total:  # noqa: ASYNC110  as a plan would ask
-            await asyncio.sleep(0.02)
+        await drained(started, memories)
         wall_s = time.perf_counter() - began_s
         daemons_s = sum(processor_s(each.pid) for each in started) - daemons_s
         server_s = processor_s(server.postmaster.pid) - server_s
@@ -132,6 +126,23 @@ async def drain_by(server: Server, folder: Path, daemons: int, events: int) -> C
     count = total - before
     read = await counted_reads(url) - reads
     return Cost(daemons_s / count * 1e6, server_s / count * 1e6, wall_s / count * 1e6, read / count)
+
+
+async def fill(daemons: Sequence[subprocess.Popen[str]], memories: Sequence[Memory], events: int) -> None:
+    """Stop the daemons and record these events into each spool."""
+    for each in daemons:
+        each.send_signal(signal.SIGSTOP)
+    for memory in memories:
+        await record(memory, memory.status.written + events)
+        await memory.synced()
+
+
+async def drained(daemons: Sequence[subprocess.Popen[str]], memories: Sequence[Memory]) -> None:
+    """Let the daemons continue, and wait until all events are visible in the tables."""
+    for each in daemons:
+        each.send_signal(signal.SIGCONT)
+    while any((memory.status.folded or 0) < memory.status.written for memory in memories):  # noqa: ASYNC110  as a plan
+        await asyncio.sleep(0.02)
 
 
 async def counted_reads(url: str) -> int:
