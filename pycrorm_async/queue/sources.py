@@ -406,7 +406,7 @@ def computed_ends(prefix: scan.ValidPrefix) -> tuple[Record, ...]:
 
 _PAUSE_S_MIN = 0.002
 """The first pause in s while no new records are synced; later pauses are longer."""
-_PAUSE_S_MAX = 0.02
+_PAUSE_S_MAX = 0.05
 """Bounds the pause between two reads of `progress`, and with it the delay until a synced record is supplied."""
 _ALIVE_CHECK_S = 0.25
 """Interval between two tests of the recorder's `alive`."""
@@ -472,9 +472,8 @@ class LiveSource:
         list, now and in every later call, when the recorder is dead or has closed its queue, or after `finish`.
         """
         pause_s = _PAUSE_S_MIN
-        while not self._has_ended():
-            synced = self._progress.recorded().synced
-            last = synced if self._until is None else min(synced, self._until)
+        while not self._has_ended(recorded := self._progress.recorded()):
+            last = recorded.synced if self._until is None else min(recorded.synced, self._until)
             if last > self.supplied:
                 try:
                     with spool.wrap_os_errors(self.folder):
@@ -563,10 +562,9 @@ class LiveSource:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _has_ended(self) -> bool:
+    def _has_ended(self, recorded: spool.RecorderStatus) -> bool:
         if self._until is not None and self.supplied >= self._until:
             return True
-        recorded = self._progress.recorded()
         if recorded.closed and self.supplied >= recorded.synced:
             return True
         # Test this also under load: once the recorder is dead, recovery supplies all records again.
