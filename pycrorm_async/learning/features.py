@@ -1,4 +1,4 @@
-"""Describe ways to pick an object up by the numbers that success depends on: the features "grasp-polar", version 3.
+"""Describe ways to pick an object up by the numbers that success depends on: the features "grasp-polar", version 4.
 
 >>> features_of([PickUpChoice(Arms.LEFT, Grasp.FRONT, -0.6, 0.1, torso=0.2)], PickUpContext(height=0.9))
 
@@ -26,11 +26,15 @@ lowering the object are the same. What is not known is NaN, such as the surface 
 | `surface` | m | the height of the surface over the lifted torso |
 | `shoulder_clearance`, `wrist_clearance` | m | from the edge to shoulder and wrist; negative above the surface |
 | `arm_above` | m | along the floor, the part of the line from shoulder to wrist that is above the surface |
+| `elbow_over`, `elbow_clearance` | m | of a hanging elbow, over the surface, and from the edge; negative above it |
+| `forearm_over` | m | of the lowest point of the forearm above the surface, over it, if the elbow hangs |
 
 Version 2 added the rows from `wrist_ahead` on: the limit of an arm's reach is one threshold of `stretch`, where trees
-need many of distance, angle and height. Version 3 added those from `surface` on, by which an arm clears a table. Later
-versions have the features of the earlier ones first, so that models of these are evaluated too. Shoulder and wrist are
-taken to be where a PR2 has them, whatever the robot: with them a few centimetres off a model is half a point worse.
+need many of distance, angle and height. Version 3 added those from `surface` on, by which an arm clears a table, and
+version 4 those from `elbow_over` on, because at high tables the forearm meets the edge. Later versions have the
+features of the earlier ones first, so that models of these are evaluated too. Shoulder and wrist are taken to be where
+a PR2 has them, and the elbow as far from both, whatever the robot: with shoulder and wrist a few centimetres off a
+model is half a point worse.
 
 All functions are pure: they know no world. `move_and_pick_up.context_of` reads a `PickUpContext` from the world.
 """
@@ -54,18 +58,21 @@ if TYPE_CHECKING:
 
 GRASP_POLAR: Final = "grasp-polar"
 """The name of the features, written into policy files."""
-GRASP_POLAR_VERSION: Final = 3
+GRASP_POLAR_VERSION: Final = 4
 """Raised when features are added, behind the others; a model of a later version is refused."""
 SHOULDER_M: Final = (0.188, 0.8)
 """The place of a PR2's shoulders: to the sides of the base's middle, and over the lifted torso."""
 WRIST_M: Final = 0.18
 """The distance of a PR2's wrist behind the middle of its fingers."""
+ARM_M: Final = (0.4, 0.321)
+"""The lengths of a PR2's upper arm, from shoulder to elbow, and of its forearm, from elbow to wrist."""
 FEATURES: Final = (
     "top", "distance", "angle", "ahead", "aside", "height",
     "width", "depth", "origin_height",
     "object_height", "edge_distance", "edge_to_base", "edge_to_grasp", "base_clearance",
     "wrist_ahead", "wrist_aside", "reach", "reach_angle", "stretch", "elevation",
     "surface", "shoulder_clearance", "wrist_clearance", "arm_above",
+    "elbow_over", "elbow_clearance", "forearm_over",
 )  # fmt: skip
 
 PLACE: Final = ("robot_in_object_x", "robot_in_object_y")
@@ -197,6 +204,13 @@ def _features(
     wrist_clearance = behind * np.cos(edge_to_base + angle) - edge_distance
     with np.errstate(divide="ignore", invalid="ignore"):  # a line along the edge is above the surface or is not
         share_above = np.clip(wrist_clearance / (wrist_clearance - shoulder_clearance), 0.0, 1.0)
+    surface = np.where(np.isnan(edge_distance), np.nan, height - known["origin_height"])
+    elbow_ahead, elbow_up = _hanging_elbow(reach, up)
+    elbow_over, wrist_over = shoulder_m + elbow_up - surface, shoulder_m + up - surface
+    with np.errstate(divide="ignore", invalid="ignore"):
+        elbow_clearance = shoulder_clearance + (wrist_clearance - shoulder_clearance) * elbow_ahead / reach
+        from_wrist = np.clip(wrist_clearance / (wrist_clearance - elbow_clearance), 0.0, 1.0)
+    lowest = wrist_over + from_wrist * np.minimum(elbow_over - wrist_over, 0.0)
     features = {
         "top": top,
         "distance": distance,
@@ -217,12 +231,24 @@ def _features(
         "reach_angle": np.arctan2(wrist_aside - aside_m, wrist_ahead),
         "stretch": np.hypot(reach, up),
         "elevation": np.arctan2(up, reach),
-        "surface": np.where(np.isnan(edge_distance), np.nan, height - known["origin_height"]),
+        "surface": surface,
         "shoulder_clearance": shoulder_clearance,
         "wrist_clearance": wrist_clearance,
         "arm_above": reach * share_above,
+        "elbow_over": elbow_over,
+        "elbow_clearance": elbow_clearance,
+        "forearm_over": np.where(wrist_clearance < 0, lowest, wrist_over),
     }
     return np.column_stack([features[name] for name in FEATURES])
+
+
+def _hanging_elbow(reach: Floats, up: Floats) -> tuple[Floats, Floats]:
+    """Return how far the elbow is ahead of and above the shoulder, m, below the line to a wrist at these distances."""
+    upper_m, fore_m = ARM_M
+    stretch, slope = np.hypot(reach, up), np.arctan2(up, reach)
+    along = np.clip((upper_m**2 - fore_m**2 + stretch**2) / (2 * np.maximum(stretch, 1e-6)), -upper_m, upper_m)
+    below = np.sqrt(upper_m**2 - along**2)
+    return along * np.cos(slope) + below * np.sin(slope), along * np.sin(slope) - below * np.cos(slope)
 
 
 def place_of(arm: Arms, grasp: Grasp, distance: float, angle: float) -> tuple[float, float]:

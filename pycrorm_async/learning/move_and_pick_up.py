@@ -31,7 +31,7 @@ from pycrorm_async.learning.policy import (
 )
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import keep_policy
-from pycrorm_async.learning.success_model import SuccessModel
+from pycrorm_async.learning.success_model import Draws, SuccessModel
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan import objects
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable, MoveTorsoActionPerformable
@@ -183,8 +183,8 @@ plane no longer maps to the floor."""
 
 PROPOSALS = 2_000
 """Random ways to pick up that a success model ranks."""
-PARENTS, NEIGHBOURS, NEIGHBOUR_M = 50, 1_000, (0.05, 0.025)
-"""The likeliest ways, and the number of ways around them, that a success model ranks too, twice: at these standard
+NEIGHBOURS, NEIGHBOUR_M = 1_000, (0.05, 0.025)
+"""The ways around the likeliest, a twentieth as many, that a success model ranks too, twice: at these standard
 deviations from them in x, y and the height of the torso, m. At a high table one way in thousands succeeds, of which
 random ones miss most."""
 ALIKE_M = 0.1
@@ -388,8 +388,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def drawn(self, rng: np.random.Generator, policy: Policy | None = None) -> MoveAndPickUpPerformable:
         """Return one sample, without regard to obstacles and visibility; `policy` saves `policy_here`.
 
-        Of a `SuccessModel`, one of `DRAWN_FROM` proposals, by its `draws`; where collisions count, one in which the
-        base is clear, if there is any. Raises `ObjectUnreachable`.
+        Of a `SuccessModel`, one of `DRAWN_FROM` proposals, by its `draws`, which may search twice as many around the
+        likeliest; where collisions count, one in which the base is clear, if there is any. Raises `ObjectUnreachable`.
         """
         if self._model is None:
             return self.chosen((self.policy_here() if policy is None else policy).sample(rng)[0])
@@ -399,8 +399,11 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             return clearance is None or self.is_clear(choice, clearance)
 
         if isinstance(self._model, SuccessModel):
-            proposals = self.lifted(self.policy_here().sample(rng, DRAWN_FROM), rng, context)
-            choice = self._model.draw(rng, proposals, context, possible)
+            places = self.policy_here()
+            proposals = self.lifted(places.sample(rng, DRAWN_FROM), rng, context)
+            neighbours = DRAWN_FROM if self._model.draws is Draws.SEARCHED else 0
+            choices, rates = self._searched(self._model, proposals, neighbours, context, places, rng)
+            choice = self._model.draw(rng, choices, context, possible, rates)
         else:
             [choice] = self._polar_ways(self._model, rng, 1, context, self.policy_here())
         return self._predicted(self._model, [choice], context)[0]
@@ -430,24 +433,44 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             proposals = self._polar_ways(model, self._rng, count, context, policy)
             return proposals, model.likelihood(proposals, context)
         choices = self.lifted(policy.sample(self._rng, count), self._rng, context)
+        return self._searched(model, choices, NEIGHBOURS if searched else 0, context, policy, self._rng)
+
+    def _searched(
+        self,
+        model: SuccessModel,
+        choices: Sequence[PickUpChoice],
+        neighbours: int,
+        context: PickUpContext,
+        policy: Policy,
+        rng: np.random.Generator,
+    ) -> tuple[Sequence[PickUpChoice], Floats]:
+        """Return these choices and as many `neighbours` of the likeliest, twice, each with its probability."""
         rates = model.probability(choices, context)
-        for off_m in NEIGHBOUR_M if searched and model.trees else ():
-            near = self._neighbours(choices, rates, off_m, context, policy)
+        for off_m in NEIGHBOUR_M if neighbours and model.trees else ():
+            near = self._neighbours(choices, rates, off_m, neighbours, context, policy, rng)
             choices, rates = [*choices, *near], np.concatenate([rates, model.probability(near, context)])
         return choices, rates
 
     def _neighbours(
-        self, choices: Sequence[PickUpChoice], rates: Floats, off_m: float, context: PickUpContext, policy: Policy
+        self,
+        choices: Sequence[PickUpChoice],
+        rates: Floats,
+        off_m: float,
+        count: int,
+        context: PickUpContext,
+        policy: Policy,
+        rng: np.random.Generator,
     ) -> list[PickUpChoice]:
         """Return random ways around the likeliest ones, at free places."""
         clearance, region = base_clearance(), policy.evidence.region
         ordered = (choices[number] for number in np.argsort(-rates, kind="stable").tolist())
-        parents = [*islice((each for each in ordered if clearance is None or self.is_clear(each, clearance)), PARENTS)]
+        clear = (each for each in ordered if clearance is None or self.is_clear(each, clearance))
+        parents = [*islice(clear, max(count // 20, 1))]
         if not parents:
             return []
         low, high = context.torso_limits or (0.0, 0.0)
-        drawn = self._rng.integers(len(parents), size=NEIGHBOURS).tolist()
-        offsets = self._rng.normal(0.0, off_m, (NEIGHBOURS, 3)).tolist()
+        drawn = rng.integers(len(parents), size=count).tolist()
+        offsets = rng.normal(0.0, off_m, (count, 3)).tolist()
         near = [
             each._replace(
                 relative_x=each.relative_x + dx,

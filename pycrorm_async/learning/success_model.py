@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 CONFIDENT: Final = 0.8
 """The probability from which a model is confident of a success. At 0.9 it would cover a tenth fewer of the ways that
 succeed, at 0.5 a fiftieth of its choices would fail."""
+SURE: Final = 0.95
+"""The probability from which a further success would teach a model little: of ways with 0.95 or more, 0.4 % failed."""
 EACH_CLASS_MIN: Final = 20
 """The successes, and also the failures, that a model needs at least: two leaves of its trees take as many rows."""
 WITHOUT_HEIGHT: Final = (
@@ -79,11 +81,15 @@ class Draws(StrEnum):
     Attributes:
         CONFIDENT: any of those that succeed with a probability of `CONFIDENT` or more; without any the likeliest.
         UNCERTAIN: weighted by p (1 - p) + 0.3 p: most lie where the model learns most, and some where it is sure.
+        SEARCHED: as those at which it is unsure are drawn, from more proposals: also from ways around the likeliest. If
+            it is sure of none, the likeliest. So it meets the ways that it will choose, and the few that succeed at
+            high tables.
         RANDOM: any.
     """
 
     CONFIDENT = "confident"
     UNCERTAIN = "uncertain"
+    SEARCHED = "searched"
     RANDOM = "random"
 
 
@@ -199,9 +205,10 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
         proposals: Sequence[PickUpChoice],
         context: PickUpContext,
         possible: Callable[[PickUpChoice], bool] = lambda _: True,
+        shares: Floats | None = None,
     ) -> PickUpChoice:
-        """Return one of the proposals, by `draws`: one that is `possible`, if any is."""
-        shares = self.probability(proposals, context)
+        """Return one of the proposals, by `draws`: one that is `possible`, if any is; `shares` saves `probability`."""
+        shares = self.probability(proposals, context) if shares is None else shares
         chance = rng.random(len(shares))
         match self.draws:
             case Draws.CONFIDENT:
@@ -209,6 +216,10 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
             case Draws.UNCERTAIN:
                 weights = np.maximum(shares * (1 - shares) + 0.3 * shares, _NEVER)
                 ranks = -np.log1p(-chance) / weights  # the order of a weighted draw without replacement
+            case Draws.SEARCHED if shares.max() < SURE:
+                ranks = 1 - shares
+            case Draws.SEARCHED:
+                ranks = -np.log1p(-chance) / np.maximum(shares * (1 - shares), _NEVER)
             case Draws.RANDOM:
                 ranks = chance
         ordered: list[PickUpChoice] = [proposals[each] for each in np.argsort(ranks, kind="stable")]

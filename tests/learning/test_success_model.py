@@ -39,7 +39,15 @@ from pycrorm_async.learning import (
     save_policy,
 )
 from pycrorm_async.learning.experiment import Experiment, Learned, read_rollouts, run
-from pycrorm_async.learning.features import FEATURES, SHOULDER_M, WRIST_M, features_of, features_of_frame, place_of
+from pycrorm_async.learning.features import (
+    ARM_M,
+    FEATURES,
+    SHOULDER_M,
+    WRIST_M,
+    features_of,
+    features_of_frame,
+    place_of,
+)
 from pycrorm_async.learning.polar_policy import PolarLeaf, PolarPolicy
 from pycrorm_async.learning.policy import Linear
 from pycrorm_async.learning.policy_cards import read_card
@@ -138,6 +146,12 @@ def test_both_arms_and_all_side_grasps_have_the_features_of_their_mirror_images_
     assert named["wrist_clearance"] == pytest.approx(WRIST_M - 0.2)
     share = (0.2 - WRIST_M) / (-shoulder.x - WRIST_M)
     assert named["arm_above"] == pytest.approx(share * math.dist(shoulder[:2], (-WRIST_M, 0)))
+    clearances = [named["wrist_clearance"], named["elbow_clearance"], named["shoulder_clearance"]]
+    assert clearances == sorted(clearances)
+    elbow = np.interp(clearances[1], clearances[::2], [named["reach"], 0.0]), named["elbow_over"] + 0.7 - SHOULDER_M[1]
+    assert elbow[1] < 0
+    assert (math.hypot(*elbow), math.dist(elbow, (named["reach"], up))) == pytest.approx(ARM_M)
+    assert named["forearm_over"] == pytest.approx(np.interp(0.0, clearances[:2], [0.1, named["elbow_over"]]))
 
 
 @pytest.mark.parametrize("grasp", list(Grasp))
@@ -275,7 +289,19 @@ def test_draws_are_confident_uncertain_or_random_and_repeatable() -> None:
         model = NEAR_AND_LOW.drawing(draws)
         assert model.draw(np.random.default_rng(1), far, PickUpContext(1.0), lambda way: way == far[0]) == far[0]
         assert model.draw(np.random.default_rng(1), far, PickUpContext(1.0), lambda _: False) in far
-    assert len({name_of(NEAR_AND_LOW.drawing(draws)) for draws in Draws}) == 3
+    assert len({name_of(NEAR_AND_LOW.drawing(draws)) for draws in Draws}) == len(Draws)
+
+
+def test_a_searching_model_draws_the_likeliest_unless_it_is_sure_and_then_where_it_is_unsure() -> None:
+    context, model = PickUpContext(0.7, torso_limits=TORSO_M), NEAR_AND_LOW.drawing(Draws.SEARCHED)
+    ways = tries(100, 4)[0]
+    shares = model.probability(ways, context)
+    assert sorted(set(shares.round(2))) == [0.12, 0.98]
+    drawn = [model.draw(np.random.default_rng(seed), ways, context) for seed in range(200)]
+    assert (model.probability(drawn, context) < 0.5).mean() > 0.6  # p (1 - p) is 0.105 there, and 0.018 elsewhere
+    unsure = [way for way, share in zip(ways, shares, strict=True) if share < 0.5]
+    likeliest = np.array([0.1] * len(unsure) + [0.9])
+    assert model.draw(np.random.default_rng(1), [*unsure, ways[0]], context, shares=likeliest) == ways[0]
 
 
 # --- polar trees ----------------------------------------------------------------------------------------------------
@@ -353,13 +379,13 @@ def test_files_of_other_versions_and_damaged_ones_are_refused(tmp_path: Path) ->
     assert load_policy(written(content)) == NEAR_AND_LOW
     with pytest.raises(PolicyFileRefused, match="has format version 4, but this program reads 1 to 3"):
         load_policy(written(content, version=4))
-    newer = content.replace(b'"features_version":1', b'"features_version":4')
-    with pytest.raises(PolicyFileRefused, match=r"grasp-polar, version 4, but this program has .*, versions 1 to 3"):
+    newer = content.replace(b'"features_version":1', b'"features_version":5')
+    with pytest.raises(PolicyFileRefused, match=r"grasp-polar, version 5, but this program has .*, versions 1 to 4"):
         load_policy(written(newer))
     for good, bad in (
         (b'"left":[1,1,2]', b'"left":[0,1,2]'),  # never ends
         (b'"right":[2,1,2]', b'"right":[3,1,2]'),
-        (b'"feature":[1,-1,-1]', b'"feature":[24,-1,-1]'),
+        (b'"feature":[1,-1,-1]', b'"feature":[27,-1,-1]'),
         (b'"value":[0.0,3.0,-3.0]', b'"value":[0.0,3.0]'),
         (b'"kind":"success model"', b'"kind":"oracle"'),
     ):
@@ -381,6 +407,21 @@ def ways_of(stage: Stage, model: SuccessModel = NEAR_AND_LOW, **options: Any) ->
     ways = list(MoveAndPickUp(stage.target, policy=model, rng=np.random.default_rng(1), **options))
     assert all(isinstance(each, PredictedPickUpPerformable) for each in ways)
     return ways  # type: ignore[return-value]  # just checked
+
+
+def test_a_searching_model_draws_ways_that_random_ones_miss(stage: Stage) -> None:
+    ring = SuccessModel(
+        "grasp-polar", 1, -2.0, (split("distance", 0.7, 1.0, -1.0), split("distance", 0.6, 0.0, 1.0),
+        split("distance", 0.61, 1.0, 0.0)), None, 100, 40,
+    )  # fmt: skip
+    drawn = {}
+    for draws in (Draws.UNCERTAIN, Draws.SEARCHED):
+        tries = MoveAndPickUp(stage.target, policy=ring.drawing(draws))
+        ways = [tries.drawn(np.random.default_rng(seed)) for seed in range(50)]
+        distances = [math.hypot(each.relative_x, each.relative_y) for each in ways]  # type: ignore[attr-defined]
+        drawn[draws] = sum(0.6 < each <= 0.61 for each in distances)
+    assert drawn[Draws.SEARCHED] > 40
+    assert drawn[Draws.UNCERTAIN] < 20
 
 
 def test_the_likeliest_of_many_ways_come_first_each_with_its_probability(stage: Stage) -> None:
