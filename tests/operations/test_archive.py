@@ -10,7 +10,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -176,9 +175,9 @@ def erase_until(lake: str, episode: str, last: int) -> None:
     """Erase an episode in a lake, and die after statement number `last`."""
     execute, count = Lake.execute, 0
 
-    def die_after_last(self: Lake, sql: str, parameters: Sequence[object] = ()) -> list[tuple[object, ...]]:
+    def die_after_last(self: Lake, sql: str) -> list[tuple[object, ...]]:
         nonlocal count
-        rows = execute(self, sql, parameters)
+        rows = execute(self, sql)
         count += 1
         if count == last:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -239,10 +238,10 @@ def archive_until_commit(url: str, lake: str) -> None:
     """Archive, and die when all files are written, before the lake knows them."""
     execute = Lake.execute
 
-    def die_before_commit(self: Lake, sql: str, parameters: Sequence[object] = ()) -> list[tuple[object, ...]]:
+    def die_before_commit(self: Lake, sql: str) -> list[tuple[object, ...]]:
         if sql == "COMMIT":
             os.kill(os.getpid(), signal.SIGKILL)
-        return execute(self, sql, parameters)
+        return execute(self, sql)
 
     Lake.execute = die_before_commit  # type: ignore[method-assign]
     asyncio.run(archived(url, lake))
@@ -431,12 +430,12 @@ async def test_an_archive_waits_for_a_catalog_that_another_process_locks_at_its_
     )
     execute, holders = Lake.execute, list[subprocess.Popen[str]]()
 
-    def locked_once(self: Lake, sql: str, parameters: Sequence[object] = ()) -> list[tuple[object, ...]]:
+    def locked_once(self: Lake, sql: str) -> list[tuple[object, ...]]:
         if sql == "COMMIT" and not holders:
             holders.append(subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True))
             assert holders[0].stdout is not None
             assert holders[0].stdout.readline() == "held\n"
-        return execute(self, sql, parameters)
+        return execute(self, sql)
 
     monkeypatch.setattr(Lake, "execute", locked_once)
     summary = await archived(url, lake)
