@@ -19,7 +19,7 @@ model is confident of, one at which it is unsure (rounds of learning), or any.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -195,9 +195,13 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
 
     def probability_of(self, rows: Floats) -> Floats:
         """Return the probability of success for rows of features, shape (rows, features) to (rows,)."""
-        parts = range(0, len(rows), _ROWS_AT_ONCE)
-        log_odds = [self.baseline + self._forest.sum(rows[first : first + _ROWS_AT_ONCE]) for first in parts]
-        return np.asarray(1 / (1 + np.exp(-np.concatenate([np.zeros(0), *log_odds]))))
+        return np.concatenate([np.zeros(0), *self.parts_of(rows, _ROWS_AT_ONCE)])
+
+    def parts_of(self, rows: Floats, rows_at_once: int) -> Iterator[Floats]:
+        """Yield the probabilities of `probability_of` for so many rows at once, so that other tasks can run between."""
+        for first in range(0, len(rows), rows_at_once):
+            log_odds = self.baseline + self._forest.sum(rows[first : first + rows_at_once])
+            yield np.asarray(1 / (1 + np.exp(-log_odds)))
 
     def draw(
         self,

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import ImpossibleCondition
 from pycrorm_async.learning import move_and_pick_up
-from pycrorm_async.learning.features import PickUpContext
+from pycrorm_async.learning.features import PickUpContext, features_of
 from pycrorm_async.learning.policy import Evidence, Floats, PickUpChoice, Policy, Region
 from pycrorm_async.learning.policy_file import AnyPolicy
 from pycrorm_async.learning.success_model import SuccessModel
@@ -49,6 +49,8 @@ CELL_M = 0.06
 """The distance in m of two places that are searched; each search shifts its places at random."""
 TORSOS = 5
 """The heights of the torso that are searched, its limits included: the highest tables need the highest torso."""
+RATED_AT_ONCE = 256
+"""The ways that a model rates before other tasks run again: 300 trees take about 15 ms."""
 FETCHING_SEARCHES, PLACING_SEARCHES = 2, 4
 """The searches that follow one another until a way is possible."""
 _TURN_RAD = math.pi / 2
@@ -123,10 +125,17 @@ class TransportPolicy:
         goals = [geometry.pick_up_poses(robot.description, obj.pose, grasp, Pose())[known:] for _, grasp in holds]
         weights: dict[int, float] = {}
         for _ in range(FETCHING_SEARCHES if holds else 0):
-            ways = self.ways(self.stands(obj.pose, region=region), holds, goals, context)
+            stands = self.stands(obj.pose, region=region)
+            await asyncio.sleep(0)
+            ways = self.ways(stands, holds, goals, context)
             choices, hold_of = ways.choices, ways.holds
-            likeness = move_and_pick_up.Likeness(choices)
-            chances = self.chances(choices, context)
+            await asyncio.sleep(0)
+            likeness, rated = move_and_pick_up.Likeness(choices), [np.zeros(0)]
+            await asyncio.sleep(0)
+            for part in self.chances(choices, context):
+                rated.append(part)
+                await asyncio.sleep(0)
+            chances = np.concatenate(rated)
             chances *= np.array([weights.get(each, 1.0) for each in hold_of.tolist()])
             for each in tried:
                 chances *= 1 - likeness.to(each) / 2
@@ -233,17 +242,17 @@ class TransportPolicy:
         ]
         return Ways(choices, at, hold_of)
 
-    def chances(self, choices: Sequence[PickUpChoice], context: PickUpContext) -> Floats:
-        """Return the chance of each choice: a model's probability, of a policy its density relative to the highest.
+    def chances(self, choices: Sequence[PickUpChoice], context: PickUpContext) -> Iterator[Floats]:
+        """Yield the chance of each choice: a model's probability, of a policy its density relative to the highest.
 
-        Where there is no preference the chances are 1, less too little to matter but for their order, which is random.
+        The chances that a model gives come in parts of `RATED_AT_ONCE`. Where there is no preference they are 1, less
+        too little to matter but for their order, which is random.
         """
         if isinstance(self.policy, SuccessModel) and self.policy.trees:
-            return self.policy.probability(choices, context)
+            yield from self.policy.parts_of(features_of(choices, context), RATED_AT_ONCE)
+            return
         rated = np.asarray(1 - 1e-9 * self._rng.random(len(choices)))
-        if isinstance(self.policy, SuccessModel):
-            return rated
-        if choices:
+        if choices and not isinstance(self.policy, SuccessModel):
             with suppress(ImpossibleCondition):
                 if isinstance(self.policy, Policy):
                     height = context.height - context.torso
@@ -254,7 +263,7 @@ class TransportPolicy:
                     density = self.policy.likelihood(choices, context)
                 if density.any():
                     rated = density / density.max()
-        return rated
+        yield rated
 
 
 class Stand(NamedTuple):
@@ -295,8 +304,11 @@ class Places:
                     break
         return self._chances.setdefault(hold, 0.0)
 
-    def of(self, arm: Arms, grasp: Grasp) -> Iterator[tuple[locations.Location | Refusal, float]]:
-        """Yield the places for this arm and grasp, the likeliest of a search first, each with its chance or refusal."""
+    def of(self, arm: Arms, grasp: Grasp) -> Iterator[tuple[locations.Location | Refusal | None, float]]:
+        """Yield the places for this arm and grasp, the likeliest of a search first, each with its chance or refusal.
+
+        Yields None after each part of the places that is rated.
+        """
         robot = objects.require_robot()
         tool = Pose(orientation=GRASP_ORIENTATIONS[grasp])
         if robot.body.attachments.get(self._target) == robot.one_arm(arm).tool_frame:
@@ -305,7 +317,11 @@ class Places:
         for number in range(PLACING_SEARCHES):
             stands = self._search(number)
             choices, stand_of, _ = self._ways.ways(stands, [(arm, grasp)], [goals], self._context)
-            chances = self._ways.chances(choices, self._context)
+            rated = [np.zeros(0)]
+            for part in self._ways.chances(choices, self._context):
+                rated.append(part)
+                yield None, 0.0
+            chances = np.concatenate(rated)
             for at in np.argsort(-chances, kind="stable").tolist():
                 base, torso, chance = stands[stand_of[at]].base, choices[at].torso, chances[at]
                 reach = locations.PlaceReach((arm,))
@@ -344,7 +360,8 @@ class PlacingLocation(locations.LocationDesignator):
     def _candidates(self) -> Iterator[locations.Location | Refusal]:
         grasp = held_grasp(objects.require_robot(), self.arm, self.held)
         for place, _ in self.policy.places(self.held, self.goal).of(self.arm, grasp):
-            yield place
+            if place is not None:
+                yield place
 
     def _no_place_failure(self) -> failures.PlanFailure:
         message = f"there is no place to stand and place {self.held.name} at {self.goal}"

@@ -269,6 +269,14 @@ def test_too_little_experience_and_frames_without_the_features_are_refused(frame
         SuccessModel.fit(frame, min_samples_leaf=0)
 
 
+def test_a_model_rates_in_parts_what_it_rates_at_once(fitted: SuccessModel, frame: pd.DataFrame) -> None:
+    rows = features_of_frame(frame)
+    for rows_at_once in (1, 7, 512, 4_096):
+        parts = list(fitted.parts_of(rows, rows_at_once))
+        assert len(parts) == -(-len(rows) // rows_at_once)
+        assert np.concatenate(parts).tolist() == fitted.probability_of(rows).tolist()
+
+
 def test_draws_are_confident_uncertain_or_random_and_repeatable() -> None:
     context = PickUpContext(0.7, torso_limits=TORSO_M)
     ways = tries(100, 4)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -109,13 +109,14 @@ async def test_tries_before_an_object_moved_count_after_it() -> None:
     class OnePlace(TransportPolicy):
         """Fetches from one place with one height of the torso, with every arm and grasp alike; places from anywhere."""
 
-        def chances(self, choices: Sequence[PickUpChoice], _: Any) -> Any:
+        def chances(self, choices: Sequence[PickUpChoice], _: Any) -> Iterator[Any]:
             if len({each.grasp for each in choices}) == 1:
-                return np.ones(len(choices))
+                yield np.ones(len(choices))
+                return
             preferred.extend(choices[:1])
             one = preferred[0]
             off = [math.dist(each[2:4], one[2:4]) if each.torso == one.torso else math.inf for each in choices]
-            return np.where(np.array(off) < 0.07, 1.0, 0.01)
+            yield np.where(np.array(off) < 0.07, 1.0, 0.01)
 
     preferred: list[PickUpChoice] = []
     holds = []
