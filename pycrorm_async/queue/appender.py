@@ -130,7 +130,7 @@ class Appender(core.Tail):
         self._span_checksum = 0
         self._quiet = True
         self._touched_from = 0
-        self._refused_bytes = 0
+        self._refused_bytes = spool_format.HEADER_BYTES
         self.blob_bytes = 0
         """Bytes of the blobs beside the segments, which share their limit."""
         self._disk_refused: str | None = None
@@ -298,7 +298,7 @@ class Appender(core.Tail):
 
     def admits_again(self, *, reserved: bool) -> bool:
         """Return whether a record as large as the largest refused one would be accepted now."""
-        frame_bytes = max(self._refused_bytes, spool_format.HEADER_BYTES)
+        frame_bytes = self._refused_bytes
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
         return self._admits_now(frame_bytes, reserved=reserved)
@@ -342,7 +342,7 @@ class Appender(core.Tail):
 
     def _forget_refused(self) -> None:
         if self._admits(self._refused_bytes, reserved=False):
-            self._refused_bytes = 0
+            self._refused_bytes = spool_format.HEADER_BYTES
 
     def _spare(self) -> int:
         if self._disk_refused is not None:
