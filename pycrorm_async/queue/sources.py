@@ -223,6 +223,7 @@ class DeadSource:
         self._ready: list[Record] = []
         """Records scanned but not supplied yet; those beyond position `_confirmed` must wait."""
         self._confirmed = 0
+        self._is_scanned = False  # set last, because a cancelled task leaves its scan to a thread
         self._scanner = scan.SegmentScanner(folder, recorder, records=self._ready)
         while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
             pass
@@ -235,7 +236,7 @@ class DeadSource:
     @property
     def all_stored(self) -> bool:
         """True if all records and computed ends are supplied and acknowledged."""
-        return self._scanner.finished and self.stored == self._confirmed
+        return self._is_scanned and self.stored == self._confirmed
 
     @property
     def holds_dead_letters(self) -> bool:
@@ -353,6 +354,7 @@ class DeadSource:
             self.lost = computed_ends(self._scanner.prefix)
             self._ready += self.lost
         self._confirmed = self._scanner.confirmed + len(self.lost)
+        self._is_scanned = not more
         return more
 
     def _next(self, events_max: int, bytes_max: int) -> _Batch:

@@ -1,8 +1,10 @@
 """Dead recorders' folders: whole records are supplied, stored segments deleted, lost synced ones are damage."""
 
+import asyncio
 import errno
 import os
 import shutil
+import threading
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -11,11 +13,12 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
-from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.queue import Spool, open_dead, sources
 from pycrorm_async.queue.format import CHECKSUM, EVENT, Frame, encode, salt_of, segment_numbers
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.maintenance import repair_folder
-from pycrorm_async.queue.scan import scan, seal, tails
+from pycrorm_async.queue.scan import ValidPrefix, scan, seal, tails
+from pycrorm_async.queue.sources import computed_ends
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
@@ -459,6 +462,35 @@ async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(sp
     assert recovered.all_stored
     recovered.release()
     assert not author.folder.exists()
+
+
+async def test_a_folder_is_not_deleted_while_the_scan_of_a_cancelled_task_reads_its_last_records(
+    spool: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    author = long_folder(spool)
+    is_reading, goes_on = threading.Event(), threading.Event()
+
+    def computed_slowly(prefix: ValidPrefix) -> tuple[Record, ...]:
+        is_reading.set()
+        assert goes_on.wait(60)
+        return computed_ends(prefix)
+
+    monkeypatch.setattr(sources, "computed_ends", computed_slowly)
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    synced = max(range(0, RECORDS, SYNCED_EVERY))
+    await recovered.get_batch(events_max=synced, bytes_max=2**22, age_s_max=0.0)
+    await recovered.acknowledge(synced)
+    reading = asyncio.create_task(recovered.get_batch(events_max=1, bytes_max=2**22, age_s_max=0.0))
+    assert await asyncio.to_thread(is_reading.wait, 60)
+    reading.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await reading
+    try:
+        assert recovered.release() is None
+        assert author.folder.exists()
+    finally:
+        goes_on.set()
 
 
 @pytest.mark.parametrize("events_max", [2, 10_000])
