@@ -8,7 +8,7 @@ and inverse kinematics of one in `Scene(heights=(0.6, 1.2), turned=True)`, witho
 --model success --heights 0.6 1.2` performs and records such rollouts.
 
 *rate*: the share of rollouts that succeed under the learned policy, each with its own height: a success model picks any
-of 100 random ways of which it is confident (P >= 0.8), a tree draws a sample. *worst*: the least rate of six bands of
+of 100 random ways of which it is confident (P >= 0.85), a tree draws a sample. *worst*: the least rate of six bands of
 height, 10 cm each. *coverage*: the share of held-out random successes of which the model is confident, or that the tree
 can draw. *best*: the rate of the likeliest of 100. *not inside*: learned without heights of 0.8 to 1.0 m, and tried at
 these; *not at the edge*: without 1.05 to 1.2 m. Rounds try where the model is uncertain, four of equal length.

@@ -52,7 +52,7 @@ from pycrorm_async.world.engines import engine_class
 from pycrorm_async.world.pose import Arms
 from pycrorm_async.world.urdf import PR2, TIAGO_PRO, Limits, RobotDescription, robot_description
 
-LEAVES = {Learned.PLACES: 25, Learned.POLAR: 20, Learned.SUCCESS: 10}
+LEAVES = {Learned.PLACES: 25, Learned.POLAR: 15, Learned.SUCCESS: 10}
 """The rows in a leaf, unless others are chosen."""
 _PLACE = ("--url", "--spool", "--read-url")
 _FROM_MEMORY = ("--from-memory", "--where", "--model", "--min-samples-leaf", "--policy", *_PLACE, "--json")
@@ -135,7 +135,7 @@ def learn(
         int | None,
         typer.Option(
             min=2,
-            help="Successes in a leaf of the tree; small leaves repeat the successes exactly. 25 for places, 20 for"
+            help="Successes in a leaf of the tree; small leaves repeat the successes exactly. 25 for places, 15 for"
             " polar features; of a model of success 10 tries.",
         ),
     ] = None,

@@ -44,9 +44,10 @@ from pycrorm_async.task_status import TaskStatus
 if TYPE_CHECKING:
     import pandas as pd
 
-CONFIDENT: Final = 0.8
-"""The probability from which a model is confident of a success. At 0.9 it would cover a tenth fewer of the ways that
-succeed, at 0.5 a fiftieth of its choices would fail."""
+CONFIDENT: Final = 0.85
+"""The probability from which a model is confident of a success. In the air, of models of 3,000 rollouts that try where
+they are unsure, 98.7, 98.9 and 99.2 % of the ways above 0.8, 0.85 and 0.9 succeed, and they cover 96.5, 95.9 and 95.0 %
+of those that succeed. Where 8 % of all tries fail whatever the way, the bounds cover 72, 62 and 39 %."""
 SURE: Final = 0.95
 """The probability from which a further success would teach a model little: of ways with 0.95 or more, 0.4 % failed."""
 EACH_CLASS_MIN: Final = 20

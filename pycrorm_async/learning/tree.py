@@ -96,7 +96,7 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
     return Policy(tuple(leaves), constant_height=constant_height, robot=robot_of(successes) or PR2.name)
 
 
-def learn_polar(successes: pd.DataFrame, *, min_samples_leaf: int = 20) -> PolarPolicy:
+def learn_polar(successes: pd.DataFrame, *, min_samples_leaf: int = 15) -> PolarPolicy:
     """Fit a policy over the features "grasp-polar" to successful pick-ups (see `polar_policy`); blocks as `learn`.
 
     It needs fewer successes than `learn`, because both arms and all grasps from the side share theirs, and it sets the
