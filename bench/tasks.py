@@ -213,6 +213,7 @@ class Ended:
     """How a task ended: the tries that were made and did not pick up, whether the first one did, what was achieved.
 
     Attributes:
+        placed: the object is at its goal, also if the arm failed after it had left it there.
         reasons: the class of the failure of each failed action, the innermost one of a try.
         cpu_s: processor time.
     """
@@ -248,7 +249,7 @@ async def performed(row: str, model: AnyPolicy | None, here: Kitchen, seed: int,
         try:
             await Retry(plan, max_tries=TRIES).perform()
         except PlanFailure:
-            placed = False
+            placed = thing not in here.robot.attachments and math.dist(thing.pose.position, goal.position) < 0.01
     reasons = [
         type(each.failure).__name__
         for each in tree
