@@ -26,8 +26,9 @@ lowering the object are the same. What is not known is NaN, such as the surface 
 | `surface` | m | the height of the surface over the lifted torso |
 | `shoulder_clearance`, `wrist_clearance` | m | from the edge to shoulder and wrist; negative above the surface |
 | `arm_above` | m | along the floor, the part of the line from shoulder to wrist that is above the surface |
-| `elbow_over`, `elbow_clearance` | m | of a hanging elbow, over the surface, and from the edge; negative above it |
-| `forearm_over` | m | of the lowest point of the forearm above the surface, over it, if the elbow hangs |
+| `elbow_over` | m | the height of the elbow over the surface, if the elbow hangs |
+| `elbow_clearance` | m | from the edge to that elbow; negative above the surface |
+| `forearm_over` | m | the height over the surface of the lowest point of the forearm that is above the table |
 
 Version 2 added the rows from `wrist_ahead` on: the limit of an arm's reach is one threshold of `stretch`, where trees
 need many of distance, angle and height. Version 3 added those from `surface` on, by which an arm clears a table, and

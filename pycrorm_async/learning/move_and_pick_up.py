@@ -184,9 +184,9 @@ plane no longer maps to the floor."""
 PROPOSALS = 2_000
 """Random ways to pick up that a success model ranks."""
 NEIGHBOURS, NEIGHBOUR_M = 1_000, (0.05, 0.025)
-"""The ways around the likeliest, a twentieth as many, that a success model ranks too, twice: at these standard
-deviations from them in x, y and the height of the torso, m. At a high table one way in thousands succeeds, of which
-random ones miss most."""
+"""A success model also ranks this many ways around the likeliest, which are a twentieth as many, and then as many
+around the likeliest by then: at these standard deviations from them in x, y and the height of the torso, m. At a high
+table one way in thousands succeeds, and random ways miss most of those."""
 ALIKE_M = 0.1
 """The distance in m, of the base and of the torso, at which two ways with the same arm and grasp are half alike."""
 DRAWN_FROM = 100

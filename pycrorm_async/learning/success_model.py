@@ -82,9 +82,9 @@ class Draws(StrEnum):
     Attributes:
         CONFIDENT: any of those that succeed with a probability of `CONFIDENT` or more; without any the likeliest.
         UNCERTAIN: weighted by p (1 - p) + 0.3 p: most lie where the model learns most, and some where it is sure.
-        SEARCHED: as those at which it is unsure are drawn, from more proposals: also from ways around the likeliest. If
-            it is sure of none, the likeliest. So it meets the ways that it will choose, and the few that succeed at
-            high tables.
+        SEARCHED: of more proposals, some of them around the likeliest: the likeliest one, if none has a probability of
+            `SURE`, else weighted by p (1 - p). So learning meets the ways that the model will choose, and the few that
+            succeed at high tables.
         RANDOM: any.
     """
 
@@ -199,7 +199,7 @@ class SuccessModel(msgspec.Struct, frozen=True, dict=True, tag_field="kind", tag
         return np.concatenate([np.zeros(0), *self.parts_of(rows, _ROWS_AT_ONCE)])
 
     def parts_of(self, rows: Floats, rows_at_once: int) -> Iterator[Floats]:
-        """Yield the probabilities of `probability_of` for so many rows at once, so that other tasks can run between."""
+        """Yield what `probability_of` returns, `rows_at_once` rows at a time; other tasks can run in between."""
         for first in range(0, len(rows), rows_at_once):
             log_odds = self.baseline + self._forest.sum(rows[first : first + rows_at_once])
             yield np.asarray(1 / (1 + np.exp(-log_odds)))

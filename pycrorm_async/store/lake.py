@@ -237,8 +237,8 @@ def _quoted(text: str) -> str:
 def _listed(names: Collection[str]) -> str:
     """Return SQL for a list of ids or hashes.
 
-    Values are parts of the statements, because DuckDB imports pandas, for 0.3 s, to examine a parameter. One text is
-    parsed twenty times as fast as a list of texts.
+    The names are part of the statement, because DuckDB imports pandas to examine a parameter, which takes 0.3 s. They
+    are one text: 100,000 names take 0.4 s so, and 1.7 s as a list of texts.
     """
     return f"string_split('{_quoted(','.join(names))}', ',')" if names else "[]::VARCHAR[]"
 
