@@ -262,6 +262,72 @@ def test_a_damaged_visual_mesh_is_left_out_and_does_not_end_the_process(
     assert f"visual of link 'base': {ENGINE.split()[0]} does not draw {tmp_path / name}" in caplog.text
 
 
+PYRAMID = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+OBJ = {
+    "indices that count back, in two parts": b"o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\no b\nv 0 0 1\nf -4 -3 -1\n",
+    "tabs": PYRAMID.replace(b" ", b"\t") + b"f\t1\t2\t3\nf\t1\t2\t4\n",
+    "continued lines": PYRAMID + b"f 1 2 \\\n3\nf 1 2 \\\r\n 4\n",
+    "materials": b"mtllib a.mtl\nusemtl red\n" + PYRAMID + b"vt 0 0\nusemtl blue\nf 1/1 2/1 3/1\nf 1//1 2//1 4//1\n",
+}
+
+
+@pytest.mark.parametrize("what", OBJ)
+def test_an_obj_has_the_vertices_that_its_faces_name(world: BulletWorld, what: str, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(OBJ[what])
+    part = Object("part", ObjectType.GENERIC_OBJECT, meshed(str(tmp_path / "a.obj")))
+    assert part.bounding_box() == ((0, 0, 0), (1, 1, 1))
+    assert world.ray_test([(0.2, 0.01, 5)], [(0.2, 0.01, -5)]) == [part]
+
+
+def test_an_obj_whose_indices_begin_at_zero_is_refused(world: BulletWorld, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(PYRAMID + b"f 0 1 2\n")
+    with pytest.raises(DescriptionNotLoadable, match="a triangle has a vertex that does not exist"):
+        Object("part", ObjectType.GENERIC_OBJECT, meshed(str(tmp_path / "a.obj")))
+
+
+@pytest.mark.parametrize(
+    ("axis", "corners"),
+    [
+        ("<up_axis>Z_UP</up_axis>", ((0, 0, 0), (1, 1, 1))),
+        ("<!-- Z_UP --><up_axis>Y_UP</up_axis>", ((0, -1, 0), (1, 0, 1))),
+        ("<up_axis> X_UP </up_axis>", ((-1, -1, 0), (0, 0, 1))),
+    ],
+)
+def test_the_up_axis_of_a_collada_file_turns_it(
+    world: BulletWorld, axis: str, corners: tuple[tuple[float, ...], ...], tmp_path: Path
+) -> None:
+    content = mesh_files.collada().replace(b"<up_axis>Z_UP</up_axis>", axis.encode())
+    (tmp_path / "a.dae").write_bytes(content)
+    part = Object("part", ObjectType.GENERIC_OBJECT, meshed(str(tmp_path / "a.dae")))
+    np.testing.assert_allclose(part.bounding_box(), corners, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [b"0", b"cm", b"-1", b"inf"])
+def test_a_collada_file_whose_unit_is_no_length_is_refused(world: BulletWorld, unit: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.dae").write_bytes(mesh_files.collada().replace(b'meter="0.01"', b'meter="' + unit + b'"'))
+    with pytest.raises(DescriptionNotLoadable, match=r"mesh .*a\.dae: it is not a readable dae file"):
+        Object("part", ObjectType.GENERIC_OBJECT, meshed(str(tmp_path / "a.dae")))
+
+
+DRAWN = {
+    "no unit.dae": mesh_files.collada().replace(b' meter="0.01"', b""),  # ended the process inside Bullet
+    "text.stl": mesh_files.text_stl(),
+    "a.off": b"OFF\n4 1 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 1 2 3\n",
+    "a.dae": mesh_files.collada(),
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_visual_mesh_of_each_format_is_drawn(
+    world: BulletWorld, name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / name).write_bytes(DRAWN[name])
+    part = Object("part", ObjectType.GENERIC_OBJECT, meshed(str(tmp_path / name), "visual"), Pose([0, 0, 0.01]))
+    picture = photograph(world, Camera(Vector(0.3, 0.3, 0.3), 3.0, 0, 10), 32, 24, smooth=False)
+    assert part.body.number in picture.bodies
+    assert not caplog.records
+
+
 def test_packages_are_found_by_name_and_by_the_variables_of_ros(
     world: BulletWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, box_of, rotation_matrix
 from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of
-from pycrorm_async.world.meshes import is_read_by_bullet, mesh_points, points_as_stl
+from pycrorm_async.world.meshes import for_bullet
 from pycrorm_async.world.urdf_model import Model, Shape, along
 
 _ROOT = -1  # Bullet's number of a body's first link
@@ -343,25 +343,27 @@ def _written(model: Model, folder: Path) -> tuple[str, tuple[str, ...]]:
     """Return a URDF of what the reader understood, with one element a line, and what Bullet does not draw.
 
     Bullet reads no line of more than 1,023 characters. The links have their centres of mass in their origins, because
-    nothing falls, and Bullet computes the frames of these centres in double precision. Collision meshes that Bullet
-    does not read are written to the folder as the points of their hulls.
+    nothing falls, and Bullet computes the frames of these centres in double precision. Meshes that Bullet does not read
+    are written to the folder.
     """
     lines, remarks = ["<robot name='model'>"], []
-    copies: dict[str, str] = {}
+    files: dict[tuple[str, str], str] = {}
     for name, link in model.links.items():
         lines.append(f"<link name={quoteattr(name)}>\n{_INERTIAL}")
         for kind, shapes in (("collision", link.collisions), ("visual", link.visuals)):
             for shape in shapes:
                 file = shape.file
-                if shape.kind == "mesh" and not is_read_by_bullet(file, collision=kind == "collision"):
-                    if kind == "visual":
+                if shape.kind == "mesh" and (kind, file) not in files:
+                    try:
+                        content = for_bullet(file, collision=kind == "collision")
+                    except (OSError, ValueError):  # of a collision mesh it was raised when its box was computed
                         fault = "Bullet does not draw" if Path(file).is_file() else "there is no file"
                         remarks.append(f"visual of link {name!r}: {fault} {file}")
                         continue
-                    if file not in copies:
-                        copies[file] = str(folder / f"{len(copies)}.stl")
-                        Path(copies[file]).write_bytes(points_as_stl(mesh_points(file)))
-                    file = copies[file]
+                    files[kind, file] = file if content is None else str(folder / f"{len(files)}.stl")
+                    if content is not None:
+                        Path(files[kind, file]).write_bytes(content)
+                file = files.get((kind, file), "")
                 lines += [
                     f"<{kind}>",
                     _origin_tag(shape.xyz, shape.rpy),
