@@ -72,7 +72,8 @@ class Body:
             if joint.mimic is not None and joint.kind is not poses.JointType.FIXED:
                 self._followers.setdefault(joint.mimic.joint, []).append(joint)
         nearest = {joint: min(max(0.0, lower), upper) for joint, (lower, upper) in self.limits.items()}
-        self.start = {joint: model.joints[joint].position(nearest) for joint in nearest}
+        free = {joint: start for joint, start in nearest.items() if model.joints[joint].mimic is None}
+        self.start = {joint: model.joints[joint].position(free) for joint in nearest}
         self.positions = dict(self.start)
         self._to_base = model.paths[self.base]
         self.pose = self.root_pose = poses.Pose()

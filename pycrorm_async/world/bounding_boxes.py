@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.world.meshes import mesh_points
-from pycrorm_async.world.pose import IDENTITY, Quaternion, Vector
+from pycrorm_async.world.pose import COORDINATE_MAX, IDENTITY, Quaternion, Vector
 from pycrorm_async.world.urdf_model import Link, Shape, origin
 
 Array = NDArray[np.float64]
@@ -85,11 +85,13 @@ _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def solids_of(shapes: Iterable[Shape]) -> tuple[Solid, ...]:
-    """Return the solids of a link's shapes in the link's frame. Raises `ValueError` for a mesh file."""
+    """Return the solids of a link's shapes in the link's frame. Raises `ValueError` for a mesh file or a length."""
     return tuple(map(_solid, shapes))
 
 
 def _solid(shape: Shape) -> Solid:
+    if shape.kind != "mesh" and not all(0 <= size <= COORDINATE_MAX for size in shape.sizes):
+        raise ValueError(f"<{shape.kind}> holds {[*shape.sizes]}; a length is 0 to {COORDINATE_MAX:g} m")
     at = origin(shape.xyz, shape.rpy)
     rotation, centre = rotation_matrix(at.orientation), np.array(at.position)
     match shape.kind:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -490,6 +491,7 @@ class Object:
     ) -> None:
         _check_identity(name, object_type)
         _check_mass(name, mass_kg)
+        _check_color(name, color)
         world = world if world is not None else current_world.get()
         if world is None:
             raise poses.NoWorld(f"object {name!r}")
@@ -689,13 +691,13 @@ class Object:
         position is passed with that of its leader. All errors are raised before anything is moved.
 
         Raises:
-            JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite, and is not the
-                joint's present one.
+            JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite, or is no
+                number, and is not the joint's present one.
             JointFollows: a joint that follows another would have to leave it.
             UnknownJoint, WorldClosed, ObjectNotInWorld.
         """
         self.check_present()
-        targets = {joint: float(position) for joint, position in positions.items()}
+        targets = {joint: _number(position) for joint, position in positions.items()}
         for joint, position in targets.items():
             lower, upper = self.joint_limits(joint)
             leader = self.body.leader(joint)
@@ -705,7 +707,7 @@ class Object:
                 raise poses.JointFollows(self.name, joint, leader)
             within = lower - _PAST_LIMIT_MAX <= position <= upper + _PAST_LIMIT_MAX
             if not (within and abs(position) <= poses.COORDINATE_MAX):
-                raise poses.JointLimitExceeded(self.name, joint, position, (lower, upper))
+                raise poses.JointLimitExceeded(self.name, joint, positions[joint], (lower, upper))
         targets = self.body.followed(targets)
         if targets:
             before = self.body.pose
@@ -813,8 +815,22 @@ def _check_identity(name: object, object_type: object) -> None:
 
 def _check_mass(name: str, mass_kg: object) -> None:
     """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
-    if mass_kg is not None and not (isinstance(mass_kg, int | float) and 0 < mass_kg < math.inf):
-        raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r}")
+    if mass_kg is not None and not (isinstance(mass_kg, int | float) and 0 < mass_kg <= sys.float_info.max):
+        raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r:.100}")
+
+
+def _check_color(name: str, color: Sequence[object] | None) -> None:
+    """Raise `ObjectRefused` unless the color is None or four finite numbers; an engine would ignore another."""
+    if color is not None and not (len(color) == 4 and all(math.isfinite(_number(each)) for each in color)):
+        raise poses.ObjectRefused(f"the color of object {name!r} must be four numbers from 0 to 1, got {color!r:.100}")
+
+
+def _number(value: object) -> float:
+    """Return a number as a float, and NaN for what is none or has no float, which every check of a range refuses."""
+    try:
+        return math.nan if isinstance(value, str | bytes) else float(value)  # type: ignore[arg-type]  # raises TypeError
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def _check_pose(name: str, pose: poses.Pose) -> poses.Pose:

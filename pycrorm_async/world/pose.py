@@ -366,11 +366,12 @@ class UnknownLink(WorldError):
 
 
 class JointLimitExceeded(WorldError):
-    """A joint position is outside the joint's hard limits (rad or m), or not finite; no joint was moved."""
+    """A joint position is outside the joint's hard limits (rad or m), or no finite number; no joint was moved."""
 
-    def __init__(self, object_name: str, joint: str, value: float, limits: tuple[float, float]) -> None:
+    def __init__(self, object_name: str, joint: str, value: object, limits: tuple[float, float]) -> None:
         lower, upper = max(limits[0], -COORDINATE_MAX), min(limits[1], COORDINATE_MAX)
-        super().__init__(f"{object_name!r}: {joint} cannot be set to {value:g}; its limits are {lower:g} to {upper:g}")
+        shown = f"{value:g}" if isinstance(value, float) else f"{value!r:.100}"
+        super().__init__(f"{object_name!r}: {joint} cannot be set to {shown}; its limits are {lower:g} to {upper:g}")
         self.object_name = object_name
         self.joint = joint
         self.value = value

@@ -218,6 +218,8 @@ def urdf_text(name: str, description: str | Path, packages: Mapping[str, str | P
             end the process inside Bullet.
     """
     is_text = isinstance(description, str) and description.lstrip(_BEFORE).startswith("<")
+    if not is_text and not isinstance(description, str | os.PathLike):
+        raise poses.DescriptionNotLoadable(name, f"it must be URDF text or a path, got {description!r:.100}")
     path, place = Path() if is_text else Path(description), "" if is_text else f"{description}: "
     try:
         if is_text:
@@ -456,7 +458,7 @@ def read_model(text: str) -> Model:
     links = {each.get("name", ""): _link(each, colors, left_out) for each in robot.findall("link")}
     unlimited: list[str] = []
     joints = {each.get("name", ""): _joint(each, left_out, unlimited) for each in robot.findall("joint")}
-    joints = {name: _following(joint, joints) for name, joint in joints.items()}
+    joints = {name: _following(joint, joints, left_out) for name, joint in joints.items()}
     children = {joint.child for joint in joints.values()}
     root = next((link for link in links if link not in children), None)
     if root is None:
@@ -534,14 +536,9 @@ def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint
         follows = Mimic(mimic.get("joint", ""), *line)
     if safety is not None:
         soft = Bounds(_number(safety, "soft_lower_limit", owner, 0.0), _number(safety, "soft_upper_limit", owner, 0.0))
-    bounds = ENDLESS if limit is None else Bounds(*(_number(limit, each, owner, 0.0) for each in ("lower", "upper")))
-    if kind in (poses.JointType.CONTINUOUS, poses.JointType.FIXED):
-        bounds = ENDLESS
-    elif limit is None and mimic is None:
+    if limit is None and mimic is None and kind in (poses.JointType.REVOLUTE, poses.JointType.PRISMATIC):
         unlimited.append(name)
-    elif bounds.lower > bounds.upper:
-        left_out.append(f"{owner}: its limits {bounds.lower:g} to {bounds.upper:g} are none")
-        bounds = ENDLESS
+    bounds = _bounds(owner, kind, limit, left_out, follows=mimic is not None)
     return Joint(
         name,
         kind,
@@ -556,7 +553,29 @@ def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint
     )
 
 
-def _following(joint: Joint, joints: Mapping[str, Joint]) -> Joint:
+def _bounds(owner: str, kind: poses.JointType, limit: Element | None, left_out: list[str], *, follows: bool) -> Bounds:
+    """Return the limits of a joint; a follower without any gets those of its leader. Raises `UrdfFault`."""
+    if limit is None:
+        return ENDLESS
+    bounds = Bounds(*(_number(limit, each, owner, 0.0) for each in ("lower", "upper")))
+    is_empty = not {"lower", "upper"} & {*limit.keys()}
+    if kind in (poses.JointType.CONTINUOUS, poses.JointType.FIXED) or (is_empty and follows):
+        return ENDLESS
+    if bounds.lower > bounds.upper:
+        left_out.append(f"{owner}: its limits {bounds.lower:g} to {bounds.upper:g} are none")
+        return ENDLESS
+    if not abs(min(max(0.0, bounds.lower), bounds.upper)) <= poses.COORDINATE_MAX:
+        raise UrdfFault(f"{owner}: <limit> leaves it no position below {poses.COORDINATE_MAX:g}")
+    if is_empty:
+        left_out.append(f"{owner}: its <limit> has neither lower nor upper, so that it cannot move")
+    return bounds
+
+
+_ROUNDED = 1e-3
+"""Limits of leaders and followers, rad or m, that differ by no more are rounded ones."""
+
+
+def _following(joint: Joint, joints: Mapping[str, Joint], left_out: list[str]) -> Joint:
     """Return the joint with the leader that follows no other, and its limits, if it has none, from those of the leader.
 
     Raises `UrdfFault` for a leader that does not exist, and for joints that follow each other.
@@ -575,9 +594,15 @@ def _following(joint: Joint, joints: Mapping[str, Joint]) -> Joint:
             break
         leader, multiplier, offset = above.joint, multiplier * above.multiplier, multiplier * above.offset + offset
     bounds = joint.bounds
-    if bounds == ENDLESS and joint.kind is not poses.JointType.CONTINUOUS and multiplier:
+    if joint.kind in (poses.JointType.REVOLUTE, poses.JointType.PRISMATIC) and multiplier:
         lower, upper = sorted(multiplier * each + offset for each in joints[leader].bounds)
-        bounds = Bounds(lower, upper)
+        if bounds == ENDLESS:
+            bounds = Bounds(lower, upper)
+        elif lower < bounds.lower - _ROUNDED or upper > bounds.upper + _ROUNDED:
+            left_out.append(
+                f"joint {joint.name!r}: its limits {bounds.lower:g} to {bounds.upper:g} do not hold, because it follows"
+                f" {leader!r} from {lower:g} to {upper:g}"
+            )
     return joint._replace(mimic=Mimic(leader, multiplier, offset), bounds=bounds)
 
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import struct
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +28,7 @@ from pycrorm_async.world import (
     describe_arm,
     describe_robot,
 )
-from pycrorm_async.world.pose import DescriptionNotLoadable, JointFollows, Vector
+from pycrorm_async.world.pose import DescriptionNotLoadable, JointFollows, JointLimitExceeded, ObjectRefused, Vector
 from pycrorm_async.world.queries import Camera, photograph
 from tests import mesh_files
 from tests.bullet import ENGINE
@@ -94,6 +97,29 @@ def test_a_follower_without_a_leader_is_refused(world: BulletWorld, leader: str,
         Object("gripper", ObjectType.ROBOT, text)
 
 
+FOLLOWER = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
+<joint name="lead" type="{kind}"><parent link="a"/><child link="b"/>{limit}</joint>
+<joint name="follow" type="revolute"><parent link="a"/><child link="c"/>{own}
+  <mimic joint="lead" multiplier="-2" offset="0.4"/></joint></robot>"""
+LIMIT = '<limit lower="0" upper="1" effort="1" velocity="1"/>'
+
+
+def test_a_follower_of_a_fixed_joint_is_at_its_offset(world: BulletWorld) -> None:
+    robot = Object("robot", ObjectType.ROBOT, FOLLOWER.format(kind="fixed", limit="", own=LIMIT))
+    assert robot.joint_positions() == {"follow": 0.4}
+    assert robot.link_pose("c").orientation == pytest.approx((math.sin(0.2), 0, 0, math.cos(0.2)))
+
+
+def test_the_limits_of_a_follower_are_those_of_its_leader_or_the_log_names_them(
+    world: BulletWorld, caplog: pytest.LogCaptureFixture
+) -> None:
+    free = FOLLOWER.format(kind="revolute", limit=LIMIT, own='<limit effort="1" velocity="1"/>')
+    assert Object("free", ObjectType.ROBOT, free).joint_limits("follow") == (-1.6, 0.4)
+    assert not caplog.records
+    Object("bound", ObjectType.ROBOT, FOLLOWER.format(kind="revolute", limit=LIMIT, own=LIMIT))
+    assert "joint 'follow': its limits 0 to 1 do not hold, because it follows 'lead' from -1.6 to 0.4" in caplog.text
+
+
 # --- limits and axes -------------------------------------------------------------------------------------------
 
 
@@ -103,8 +129,37 @@ def test_a_continuous_joint_is_endless_whatever_its_limits(world: BulletWorld) -
     cart.set_joint_position("hinge", 7.0)
 
 
-def test_limits_without_lower_and_upper_are_zero(world: BulletWorld) -> None:
+def test_limits_without_lower_and_upper_are_zero(world: BulletWorld, caplog: pytest.LogCaptureFixture) -> None:
     assert Object("a", ObjectType.ROBOT, hinge(limit='<limit effort="1"/>')).joint_limits("hinge") == (0, 0)
+    assert "joint 'hinge': its <limit> has neither lower nor upper, so that it cannot move" in caplog.text
+
+
+@pytest.mark.parametrize("position", ["0.3", b"0", None, 1j, [0.1], 10**400])
+def test_a_position_that_is_no_number_is_refused(world: BulletWorld, position: object) -> None:
+    arm = Object("arm", ObjectType.ROBOT, hinge())
+    with pytest.raises(JointLimitExceeded, match=re.escape(f"to {position!r:.100}; its limits are -1 to 1")):
+        arm.set_joint_position("hinge", position)  # type: ignore[arg-type]  # the error that is shown
+    assert arm.joint_position("hinge") == 0
+
+
+@pytest.mark.parametrize("position", [np.float32(0.5), np.int64(0), True, Decimal("0.5"), Fraction(1, 2)])
+def test_a_position_of_any_type_of_number_becomes_a_float(world: BulletWorld, position: float) -> None:
+    arm = Object("arm", ObjectType.ROBOT, hinge())
+    arm.set_joint_position("hinge", position)
+    assert (type(arm.joint_position("hinge")), arm.joint_position("hinge")) == (float, float(position))
+
+
+@pytest.mark.parametrize("color", [(1, 0, 0), "red", ("r", "e", "d", "!"), (math.nan, 0, 0, 1)])
+def test_a_color_that_is_not_four_numbers_is_refused(world: BulletWorld, color: object) -> None:
+    with pytest.raises(ObjectRefused, match="the color of object 'milk' must be four numbers"):
+        Object("milk", ObjectType.MILK, color=color)  # type: ignore[arg-type]  # the error that is shown
+
+
+@pytest.mark.parametrize("shape", ['box size="1 1 -1"', 'sphere radius="-1"', 'cylinder radius="1" length="1e10"'])
+def test_a_length_that_is_none_is_refused(world: BulletWorld, shape: str) -> None:
+    text = SHAPE.format(kind="collision", shape=f"<geometry><{shape}/></geometry>")
+    with pytest.raises(DescriptionNotLoadable, match=r"collision of link 'base': <\w+> holds .* a length is 0 to"):
+        Object("r", ObjectType.ROBOT, text)
 
 
 @pytest.mark.parametrize(("lower", "upper", "start"), [(-3, -0.1, -0.1), (0.5, 2, 0.5), (-1, 1, 0)])
@@ -142,6 +197,7 @@ WORDS = {
     "an axis": (hinge(axis="0 0 up"), "joint 'hinge': <axis xyz=\"0 0 up\">: 'up' is not a number"),
     "no axis": (hinge(axis="0 0 0"), "has no direction"),
     "a limit": (hinge(limit='<limit lower="-1" upper="1.57."/>'), "<limit upper=\"1.57.\">: '1.57.' is not a number"),
+    "a limit without end": (hinge(limit='<limit lower="inf" upper="inf"/>'), "<limit> leaves it no position"),
     "an effort": (hinge(limit='<limit lower="0" upper="1" effort="much"/>'), "'much' is not a number"),
     "Python's own": (hinge(limit='<limit lower="0" upper="1_0"/>'), "'1_0' is not a number"),
     "a multiplier": (GRIPPER.replace('"0.5"', '"half"'), "<mimic multiplier=\"half\">: 'half' is not a number"),
