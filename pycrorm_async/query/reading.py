@@ -334,14 +334,8 @@ class Reading:
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 summaries = await named_queries.episodes(connection, choice)
-            digests = await self._log.last_digests(summaries[0].number, summaries[-1].number) if summaries else {}
             folding = len(await self._log.behind()) if choice is None else 0
-        listed = Episodes(
-            replace(each, digest_sequence=digest.sequence, digest=digest.digest)
-            if (digest := digests.get(each.number)) is not None
-            else each
-            for each in summaries
-        )
+            listed = Episodes(await self._with_digests(summaries))
         listed.folding = folding
         return listed
 
@@ -357,7 +351,18 @@ class Reading:
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
-                return await named_queries.episode_named(connection, name)
+                summary = await named_queries.episode_named(connection, name)
+            return (await self._with_digests([summary]))[0]
+
+    async def _with_digests(self, summaries: Sequence[EpisodeSummary]) -> list[EpisodeSummary]:
+        """Return the episodes, which are in the order of their numbers, each with the last digest of the log."""
+        digests = await self._log.last_digests(summaries[0].number, summaries[-1].number) if summaries else {}
+        return [
+            replace(each, digest_sequence=digest.sequence, digest=digest.digest)
+            if (digest := digests.get(each.number)) is not None
+            else each
+            for each in summaries
+        ]
 
     async def tree(self, episode: AskedEpisode, *, images: bool | None = None) -> TaskTree:
         """Return the task tree of an episode, simulations included, as a list: each node comes before its children.

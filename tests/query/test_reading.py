@@ -107,6 +107,7 @@ async def test_the_overview_has_a_line_for_every_episode(reading: Reading) -> No
     summaries = await reading.episodes()
     assert [replace(each, digest_sequence=None, digest=None) for each in summaries] == [first, second]
     assert [(each.digest_sequence, each.digest is None) for each in summaries] == [(None, True), (11, False)]
+    assert [await reading.episode(name) for name in ("1", "2")] == summaries
 
 
 @pytest.mark.slow
