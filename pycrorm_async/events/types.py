@@ -176,6 +176,13 @@ class MissingValue(_Value, frozen=True):
     repr: str = ""
 
 
+def is_missing(value: Any) -> bool:
+    """Return whether a JSON value is a `MissingValue`."""
+    if not isinstance(value, dict) or "missing" not in value:
+        return False
+    return isinstance(value["missing"], str) and value.keys() <= {"missing", "repr"}
+
+
 class BlobReference(_Value, frozen=True):
     """A reference to a blob, a content that is stored beside the log: its SHA-256, media type and size in bytes.
 

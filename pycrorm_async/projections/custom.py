@@ -46,12 +46,19 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.fields import is_reserved
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, Happening, NodeEnded, NodeStarted
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    Happening,
+    NodeEnded,
+    NodeStarted,
+    is_missing,
+)
 from pycrorm_async.projections.columns import OWN, Storage, column_type, physical_name
 from pycrorm_async.projections.fold import decode_events, stored_rows
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.named_values import NamedValues
-from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, is_missing, json_text, microseconds, row_of
+from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, json_text, microseconds, row_of
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog

@@ -25,6 +25,7 @@ from pycrorm_async.events.types import (
     Observed,
     PoseReference,
     PoseValue,
+    is_missing,
 )
 from pycrorm_async.projections.columns import COLUMNS, EPISODE, Union
 from pycrorm_async.store.stored import StoredEvent
@@ -200,13 +201,6 @@ def pose_row(own: int, number: int, pose: PoseValue) -> Row:
     x, y, z = pose.position
     qx, qy, qz, qw = pose.orientation
     return own, number, x, y, z, qx, qy, qz, qw, pose.frame, pose.time_ns // 1000
-
-
-def is_missing(value: Any) -> bool:
-    """Return whether this value is a recorded `MissingValue`."""
-    if not isinstance(value, dict) or "missing" not in value:
-        return False
-    return isinstance(value["missing"], str) and value.keys() <= {"missing", "repr"}
 
 
 def scalar(field: FieldDeclared, kind: str, value: Any) -> Any:

@@ -51,7 +51,7 @@ from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, Pro
 from pycrorm_async.projections.findings import Comparison, EpisodeRange, TableCheck, TableDifference, VerifyResult
 from pycrorm_async.projections.generations import select_generation
 from pycrorm_async.projections.pipeline import Batch
-from pycrorm_async.projections.row_batch import is_missing, row_of
+from pycrorm_async.projections.row_batch import row_of
 from pycrorm_async.projections.verify import ProjectionCheck
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.recall.blocks import EPISODE_SHIFT, CaseBlock, decode, encode, is_same, merge
@@ -499,7 +499,7 @@ class EpisodeCases:
         parameters = started.parameters
         for value in parameters.values():
             if type(value) is dict and ("missing" in value or "pose_of" in value):
-                present = {name: each for name, each in parameters.items() if not is_missing(each)}
+                present = {name: each for name, each in parameters.items() if not event_types.is_missing(each)}
                 parameters = event_types.with_poses(present, self._poses_of)
                 break
         symbols, numbers = situation(fields, parameters, started.robot, self._world)

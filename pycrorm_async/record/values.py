@@ -378,6 +378,8 @@ def _encode_dict(encode: Encoder, value: Any, enum: type[Enum] | None, reference
     }
     if len(entries) < len(value):
         raise UnrecordableValue("two keys of the dict have the same text")
+    if event_types.is_missing(entries):
+        raise UnrecordableValue("a dict of the text `missing`, alone or with `repr`, marks a missing value")
     return entries
 
 

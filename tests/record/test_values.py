@@ -242,3 +242,8 @@ def test_none_in_a_list_or_a_dict_is_none() -> None:
 def test_two_keys_with_one_text_are_refused() -> None:
     with pytest.raises(UnrecordableValue, match="two keys of the dict have the same text"):
         write("dict", {"LEFT": 1, Arms.LEFT: 2}, item="integer")
+    for marker in ({"missing": "milk"}, {"missing": "milk", "repr": "a carton"}):
+        with pytest.raises(UnrecordableValue, match="marks a missing value"):
+            write("dict", marker, item="text")
+    assert write("dict", {"missing": "milk", "shelf": "2"}, item="text") == {"missing": "milk", "shelf": "2"}
+    assert write("dict", {"missing": 3}, item="integer") == {"missing": 3}
