@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import zip_longest
 from typing import Any, TypeAlias
 
@@ -22,7 +22,7 @@ from pycrorm_async.orm import Object, Pose, ProcessMetaData
 from pycrorm_async.query.frames import imported
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, nodes_of
 from pycrorm_async.query.question import AskedEpisode, EpisodeReader, episode_name
-from pycrorm_async.query.text import NotebookValue, parameters_text
+from pycrorm_async.query.text import NotebookValue, value_text
 
 _SAME = 6
 """Decimals to which numbers are compared, and positions in m."""
@@ -317,7 +317,7 @@ def _differences_of(path: _Path, one: NodeSummary, other: NodeSummary) -> Iterat
         missing = object()
         values = one.parameters.get(name, missing), other.parameters.get(name, missing)
         if _comparable(values[0]) != _comparable(values[1]):
-            first, second = (None if each is missing else _value_text(name, each) for each in values)
+            first, second = _different_texts([None if each is missing else each for each in values])
             yield Difference("node", where, f"parameter {name}", first, second, *ids)
 
 
@@ -329,8 +329,13 @@ def _nth_text(name: str, nth: int) -> str:
     return name if nth == 1 else f"{name} {nth}"
 
 
-def _value_text(name: str, value: Any) -> str:
-    return parameters_text({name: value}, full=True).removeprefix(f"{name}=")
+def _different_texts(values: Sequence[Any]) -> list[str | None]:
+    """Return the texts of values that differ: rounded, or exact where rounded ones would be the same."""
+    for text in (partial(value_text, full=True), partial(value_text, full=True, exact=True), _text):
+        texts = [None if each is None else text(each) for each in values]
+        if texts[0] != texts[1]:
+            break
+    return texts
 
 
 def _comparable(value: Any) -> Any:
@@ -384,11 +389,13 @@ def _place_differences(first: Mapping[_Nth, _Place], second: Mapping[_Nth, _Plac
         one, other = first.get(key), second.get(key)
         if _comparable(list(one or ())) != _comparable(list(other or ())):
             difference = _presence(one, other) or "place"
-            yield Difference("object", _nth_text(*key), difference, _place_text(one), _place_text(other))
+            digits = 3 if _place_text(one, 3) != _place_text(other, 3) else _SAME
+            texts = _place_text(one, digits), _place_text(other, digits)
+            yield Difference("object", _nth_text(*key), difference, *texts)
 
 
-def _place_text(place: _Place | None) -> str | None:
-    return None if place is None else "(" + ", ".join(f"{each:.3f}" for each in place) + ")"
+def _place_text(place: _Place | None, digits: int) -> str | None:
+    return None if place is None else "(" + ", ".join(f"{each:.{digits}f}" for each in place) + ")"
 
 
 def _presence(one: Any, other: Any) -> str | None:

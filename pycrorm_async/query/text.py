@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.events.types import BLOB_KEY
+from pycrorm_async.events.types import BLOB_KEY, is_missing
 
 #
 # Format recorded parameters and durations on one line, for the terminal, notebooks and the report.
@@ -39,9 +39,9 @@ def value_text(value: Any, *, full: bool = False, exact: bool = False) -> str:
     if isinstance(value, dict) and BLOB_KEY in value:
         content = f", sha256 {value[BLOB_KEY]}" if full else ""
         return f"{value.get('media_type')} of {value.get('size')} bytes{content}"
-    if isinstance(value, dict) and value.get("name"):
+    if isinstance(value, dict) and value.get("name") and ("object" in value or "dtype" in value):
         return str(value["name"])
-    if isinstance(value, dict) and "missing" in value:
+    if is_missing(value):
         return f"? ({one_line(value['missing'], None)})" if full else "?"
     if isinstance(value, float):
         return repr(value) if exact else f"{value:g}"

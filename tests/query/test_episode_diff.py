@@ -17,6 +17,7 @@ from pycrorm_async.events.types import (
     ObjectMoved,
     ObjectReference,
     ObjectRemoved,
+    ObjectValue,
 )
 from pycrorm_async.query.episode_diff import Difference
 from pycrorm_async.query.reading import Reading
@@ -72,10 +73,25 @@ def cups(number: int, *places: float) -> Script:
     return script
 
 
+def near(number: int, x: float) -> Script:
+    """Return an episode whose numbers differ from those of another `x` by less than three digits show."""
+    script = Script(number)
+    script.put(EpisodeStarted("near", "me", "host", "1", "3.11"))
+    cup = script.put(ObjectAdded("cup", "CUP", pose(x)))
+    part = ObjectValue("ObjectPart", "lid", "LID", pose(x), ObjectReference(cup, cup))
+    root = script.put(NodeStarted("root"))
+    for dtype, parameters in ((NAVIGATE, {"target_location": pose(x)}), (PICK_UP, {"object_designator": part})):
+        node = script.put(NodeStarted("action", root, name_of(dtype), parameters))
+        script.put(NodeEnded(node, "SUCCEEDED"))
+    script.put(NodeEnded(root, "SUCCEEDED"))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
 @pytest.fixture(scope="module")
 def filled_url(module_database_url: str) -> str:
     scripts = [trip(1, arm="LEFT", x=2, fails=False), trip(2, arm="RIGHT", x=3, fails=True), *RANDOM]
-    scripts += [cups(5, 1, 2, 3), cups(6, 1, 4)]
+    scripts += [cups(5, 1, 2, 3), cups(6, 1, 4), near(7, 1.0001), near(8, 1.0002)]
     records = [*TYPES, *(record for each in scripts for record in each.records)]
     run_in_own_loop(append_and_fold(module_database_url, records))
     return module_database_url
@@ -93,7 +109,7 @@ async def test_two_runs_of_one_plan_do_not_differ_although_their_times_do(readin
     compared = await reading.diff(3, 4)
     assert [(each.of, each.where) for each in compared.differences] == [("episode", "description")]
     assert compared.same_nodes == compared.first.nodes > 5
-    assert not await reading.diff("last", 6)
+    assert not await reading.diff("last", 8)
 
 
 async def test_each_difference_has_its_place_and_both_values(reading: Reading) -> None:
@@ -134,6 +150,18 @@ async def test_objects_of_one_name_correspond_in_the_order_they_were_added(readi
         Difference("object", "cup 2", "place", "(2.000, 0.000, 0.000)", "(4.000, 0.000, 0.000)"),
         Difference("object", "cup 3", "only in first", "(3.000, 0.000, 0.000)", None),
     ]
+
+
+async def test_values_that_are_the_same_when_rounded_have_all_their_digits(reading: Reading) -> None:
+    compared = await reading.diff(7, 8)
+    upright = "turned (0.0, 0.0, 0.0, 1.0)"
+    texts = [(each.what, each.first, each.second) for each in compared.differences]
+    assert texts[0] == ("parameter target_location", f"(1.0001, 0.0, 0.0) {upright}", f"(1.0002, 0.0, 0.0) {upright}")
+    assert texts[1][0] == "parameter object_designator"
+    assert '"name":"lid"' in str(texts[1][1])
+    assert "1.0001" in str(texts[1][1])
+    assert str(texts[1][2]) == str(texts[1][1]).replace("1.0001", "1.0002")
+    assert texts[2:] == [("place", "(1.000100, 0.000000, 0.000000)", "(1.000200, 0.000000, 0.000000)")]
 
 
 @pytest.mark.soak_on("postgresql")
