@@ -29,7 +29,7 @@ import msgspec
 from pycrorm_async.clock import microseconds_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import episode_text, named_episode_id
-from pycrorm_async.events.types import EpisodeStatus, FieldDeclared, NodeStatus, ObjectValue, PoseValue
+from pycrorm_async.events.types import EpisodeStatus, FieldDeclared, NodeStatus, ObjectValue, PoseValue, is_missing
 from pycrorm_async.progress_bar import ProgressCallback
 from pycrorm_async.record.declarations import FieldSpec
 from pycrorm_async.record.plan_types import built_in_declaration
@@ -50,6 +50,10 @@ _ENDED_MAX = 20
 _WORDS = re.compile(r"[A-Za-z0-9]+")
 _NAME_MAX = 50
 """Bounds the characters of the name of a type or a field: PostgreSQL cuts names of tables at 63 bytes."""
+_REAL_MAX = 2**53
+"""Real numbers have every whole number up to this one, and miss some of the larger ones."""
+_WHOLE = range(-(2**63), 2**63)
+"""The numbers that a column of integers holds."""
 _END_STATUSES = frozenset(get_args(EpisodeStatus)) - {"RUNNING"}
 
 TIMES: Final = range(-(2**63), 2**63)
@@ -252,6 +256,9 @@ class Intake:
         further: dict[str, Any] = {}
         for given, value in parameters.items():
             if value is None:
+                continue
+            if is_missing(value):
+                self.left_out("values", "the memory that wrote the file could not record them")
                 continue
             name = _name_of(given, "value")
             if name in values or (name not in declared and len(declared) >= FIELDS_MAX):
@@ -458,7 +465,8 @@ def _recorded(value: Any, known: FieldDeclared | None) -> tuple[FieldSpec, Any]:
         case bool():
             return "boolean", value
         case int() | float():
-            return "real", value
+            kind = _number_type([value])
+            return kind, value if kind != "text" else str(value)
         case str():
             return "text", value
         case ObjectKey():
@@ -476,12 +484,21 @@ def _recorded(value: Any, known: FieldDeclared | None) -> tuple[FieldSpec, Any]:
     return "text", json_text(value)
 
 
-def _item_type(values: Iterable[Any]) -> Literal["real", "text"] | None:
+def _item_type(values: Iterable[Any]) -> Literal["real", "integer", "text"] | None:
     """Return the type of the items of a list or dict; None if it is empty, or they are of several types."""
-    types = {type(each) for each in values}
+    items = list(values)
+    types = {type(each) for each in items}
     if types and types <= {int, float}:
-        return "real"
+        kind = _number_type(items)
+        return kind if kind != "text" else None
     return "text" if types == {str} else None
+
+
+def _number_type(numbers: Iterable[int | float]) -> Literal["real", "integer", "text"]:
+    """Return the type in which none of these numbers loses a digit."""
+    if all(isinstance(each, float) or abs(each) <= _REAL_MAX for each in numbers):
+        return "real"
+    return "integer" if all(isinstance(each, int) and each in _WHOLE for each in numbers) else "text"
 
 
 def pose_in(value: Any) -> PoseValue | None:

@@ -48,6 +48,7 @@ _TIMES_NS = range(2**63)
 _EPOCH_US = range(10**15, 10**16)
 """Times in µs that count from 1970: those of the years 2001 to 2286. Other clocks of traces begin near zero."""
 _GAP = re.compile(r"[\s,]*")
+_WHOLE = re.compile(r"-?[0-9]{1,19}")
 _STATUSES = frozenset(get_args(NodeStatus)) - {"RUNNING"}
 _INSTANTS = frozenset("iIRn")
 _Give: TypeAlias = Callable[[IntakeEpisode, int], None]
@@ -447,6 +448,7 @@ class _Trace:
         self.resources: dict[str, Any] = {}
         self.begin, self.end, self.status = 2**63 - 1, 0, "UNKNOWN"
         self._root: str | None = None
+        self._of_root: list[tuple[int, str, dict[str, Any]]] = []
         self._description = ""
 
     def add(self, raw: Mapping[str, Any], settings: TraceMap) -> str | None:
@@ -462,8 +464,14 @@ class _Trace:
         own = {name.removeprefix(_OWN): attributes.pop(name) for name in list(attributes) if name.startswith(_OWN)}
         end = end or None  # zero is an absent field
         parent = str(raw.get("parentSpanId") or "").lower() or None
+        instants = [
+            (_time(_whole(each.get("timeUnixNano"))) or start, str(each.get("name") or "event"), _attributes(each))
+            for each in _items([raw], "events")
+            if "kind" not in own or each.get("name") != "exception"  # our own export has the failure twice
+        ]
         if own.get("kind") == "root":
             self._root, self._description, self.status = key, name, str(own.get("status", "UNKNOWN"))
+            self._of_root = sorted(instants, key=itemgetter(0))
             return None
         if "kind" in own:
             span = _own_span({**own, "node": key, "parent": parent}, name, attributes, start, end, has_objects=False)
@@ -471,11 +479,7 @@ class _Trace:
             span = NodeSpan(key, settings.types.get(name, name), attributes, start, end, parent=parent)
             span.kind = settings.kinds.get(span.dtype, "action")
             span.status, span.failure = _outcome(raw, settings)
-        span.instants = [
-            (_time(_whole(each.get("timeUnixNano"))) or start, str(each.get("name") or "event"), _attributes(each))
-            for each in _items([raw], "events")
-            if "kind" not in own or each.get("name") != "exception"  # our own export has the failure twice
-        ]
+        span.instants = instants
         self.spans[key] = span
         return None
 
@@ -499,7 +503,8 @@ class _Trace:
         name = f"{trace_id}-{digest}"
         episode = intake.episode(name, self.begin, description=described, metadata=metadata)
         with episode:
-            give_spans(episode, spans)
+            others = [(at, partial(_observation(name, values), episode)) for at, name, values in self._of_root]
+            give_spans(episode, spans, others)
             episode.ended(self.status, self.end)
 
 
@@ -552,4 +557,4 @@ def _value(value: Any) -> Any:
 
 def _whole(value: Any) -> Any:
     """Return the number of a text, as 64-bit numbers are in JSON; another value unchanged."""
-    return int(value) if isinstance(value, str) and value.isdecimal() and len(value) < 20 else value
+    return int(value) if isinstance(value, str) and _WHOLE.fullmatch(value) else value

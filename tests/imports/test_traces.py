@@ -85,6 +85,41 @@ def test_an_import_of_our_own_export_has_the_same_tree_statuses_times_and_poses(
         assert ask(tmp_path / "memory.db", query) == ask(source, query)
 
 
+def recorded_values(url: str) -> None:
+    """Record whole numbers that no real number has, a value that is missing, and observations of the root."""
+    with Memory.sync(url) as memory:
+        given = {"i": int, "n": int, "r": float, "many": list[int], "by_name": dict[str, int]}
+        count = memory.recording.type("action", "Count", given)
+        with memory.recording.episode(description="count", id="count", at=AT) as episode:
+            episode.observe("begun", {"load": -3}, at=AT + 1)
+            for key, (number, real) in enumerate(((2**53 + 1, 0.5), (-(2**63), math.nan), (2**62 + 1, -0.0))):
+                values = {"i": number, "n": -5, "r": real, "many": [number, 1], "by_name": {"a": number}}
+                episode.start(key, count, values, at=AT + 10 * (key + 1))
+                episode.end(key, "SUCCEEDED", at=AT + 10 * (key + 1) + 5)
+            episode.observe("ended", "ok", at=AT + 99)
+            episode.close(at=AT + 100)
+        memory.flush()
+
+
+@pytest.mark.parametrize("file_format", ["trace", "otlp"])
+def test_whole_numbers_keep_each_digit_and_what_was_missing_stays_so(tmp_path: Path, file_format: str) -> None:
+    source = tmp_path / "source.db"
+    recorded_values(f"sqlite:///{source}")
+    file = tmp_path / "count.json"
+    done = pycrorm("export", "1", "--format", file_format, "--out", file, "--url", f"sqlite:///{source}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = imported(tmp_path, "trace", file)
+    assert list(report.left_out.items()) == [(("values", "the memory that wrote the file could not record them"), 1)]
+    stored = ask(tmp_path / "memory.db", "SELECT payload FROM event WHERE type = 'NodeStarted' ORDER BY sequence")
+    first, second, third = (json.loads(payload)["parameters"] for (payload,) in stored[1:])
+    big, least = 2**53 + 1, -(2**63)
+    assert first == {"i": big, "n": -5.0, "r": 0.5, "many": [big, 1], "by_name": {"a": big}}
+    assert second == {"i": least, "n": -5.0, "many": [least, 1], "by_name": {"a": least}}
+    assert (third["i"], math.copysign(1, third["r"])) == (2**62 + 1, -1.0)
+    observed = "SELECT json_extract(payload, '$.name'), wall_ns FROM event WHERE type = 'Observed' ORDER BY sequence"
+    assert ask(tmp_path / "memory.db", observed) == [("begun", AT + 1), ("ended", AT + 99)]
+
+
 def trace_of(*events: dict[str, Any]) -> str:
     return json.dumps({"traceEvents": [{"pid": 1, "tid": 1, **each} for each in events]})
 
