@@ -579,6 +579,8 @@ _CUT = 1_000
 """Characters that a text of an event that is too large is shortened to."""
 _MISSING_BYTES = 400
 """Bounds from below the values worth leaving out: about the encoded size of the `MissingValue` that replaces one."""
+_LEFT_OUT_MAX = 64
+"""Bounds the parts that are left out of one event, because the rest is encoded again after each."""
 ROBOT = "robot state"
 """The name under which a missing robot state is counted; the blank keeps it apart from every field's name."""
 
@@ -592,8 +594,8 @@ def fitted(event: event_types.Happening, bytes_max: int) -> tuple[event_types.Ha
     """Return the event without the parts that cannot be recorded, and the reason for each by its name.
 
     A parameter or a result becomes a `MissingValue`, an observed value null, a text is cut, and any other part gets the
-    default of its field. An event of very many small parts may still be too large. Raises `NotEncodable` if a part
-    without default cannot be recorded.
+    default of its field. An observation that is still too large, of very many small values, loses all of them. Raises
+    `NotEncodable` if a part without default cannot be recorded.
     """
     reasons: dict[str, str] = {}
     for name in event.__struct_fields__:
@@ -605,7 +607,7 @@ def fitted(event: event_types.Happening, bytes_max: int) -> tuple[event_types.Ha
             event = replace(event, **{name: _recordable(value, _defaults(event), name)})
     parts = _parts(event)
     sizes = {name: encoded_bytes(value) for name, value in parts.items()}
-    for name in sorted(sizes, key=sizes.__getitem__, reverse=True):
+    for name in sorted(sizes, key=sizes.__getitem__, reverse=True)[:_LEFT_OUT_MAX]:
         if sizes[name] <= _MISSING_BYTES or fits(event, bytes_max):
             break
         reason = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for the record (record_bytes_max)"
@@ -613,8 +615,13 @@ def fitted(event: event_types.Happening, bytes_max: int) -> tuple[event_types.Ha
             smaller: Any = live_values.missing_value(reason, parts[name])
         else:
             smaller = _shorter(parts[name])
-        reasons.setdefault(name, reason)
+        reasons.setdefault(name or "values", reason)
         event = _with_part(event, name, smaller)
+    if isinstance(event, event_types.Observed) and not fits(event, bytes_max):
+        size = encoded_bytes(event.values)
+        reason = f"its {len(parts):,} values take {size:,} bytes, {bytes_max:,} are allowed for the record"
+        reasons = {"values": f"{reason} (record_bytes_max)"}
+        event = replace(event, values=None, missing={"": reasons["values"]})
     return event, reasons
 
 

@@ -221,6 +221,24 @@ async def test_what_cannot_be_recorded_is_missing_with_its_reason_and_counted(tm
     assert (await verified(f"sqlite:///{tmp_path}/memory.db")).damage == 0
 
 
+@pytest.mark.parametrize(
+    "values", [{f"k{each}": each for each in range(2_000)}, dict.fromkeys(map(str, range(60)), "x" * 90)]
+)
+async def test_an_observation_of_too_many_small_values_is_there_without_them_and_says_why(
+    tmp_path: Path, values: dict[str, Any]
+) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=Settings(record_bytes_max=2**12)) as memory:
+        async with memory.episode(description="seen"):
+            memory.observe("many", values)
+        await memory.flush()
+        assert_no_faults(memory)
+        async with memory.session() as session:
+            [row] = (await session.scalars(select(Observation))).all()
+        reason = f"its {len(values):,} values take {len(json.dumps(values, separators=(',', ':'))):,} bytes, 4,096 are"
+        assert row.items[0].missing == f"{reason} allowed for the record (record_bytes_max)"
+        assert memory.status.missing == (1, f"observation many.values: {row.items[0].missing}")
+
+
 async def test_with_refuse_a_value_that_cannot_be_recorded_raises(tmp_path: Path) -> None:
     settings = Settings(on_unrecordable="refuse")
     url = f"sqlite:///{tmp_path}/memory.db"
