@@ -426,24 +426,46 @@ def describe_robot(
 
     Raises:
         CallerError: the SRDF cannot be read or does not fit the URDF, `payload_kg` names an arm that the robot lacks,
-            or the model has no such base link.
+            `drive` is no `Drive`, or the model lacks a link, a joint or the state `park` that is named.
         DescriptionNotLoadable: the URDF has a fault.
     """
-    model = read_model(urdf_text(name, urdf, packages)) if base_link or srdf is not None else None
+    model = read_model(urdf_text(name, urdf, packages))
+    model.path(base_link)
     postures: dict[str, dict[str, float]] = {}
-    if model is not None:
-        model.path(base_link)
-    if srdf is not None and model is not None:
+    if srdf is not None:
         semantics = parsed_srdf(name, srdf)
         for state in semantics.findall("group_state"):
             if positions := _positions(name, state, model):
                 postures.setdefault(state.get("name", ""), {}).update(positions)
         _log_unknown(name, semantics, model)
+        if park not in {"park", *postures}:
+            raise CallerError(
+                f"the SRDF of {name!r} has no state {park!r}; its states are: {', '.join(postures) or 'none'}"
+            )
         if arms is None:
             arms = _arms(name, model, semantics, postures.get(park, {}))
     facts.setdefault("postures", postures)
     arms = dict(arms or {}) if payload_kg is None else with_payload(arms or {}, payload_kg)
-    return RobotDescription(name=name, urdf=urdf, base_link=base_link, arms=arms, packages=dict(packages), **facts)
+    robot = RobotDescription(name=name, urdf=urdf, base_link=base_link, arms=arms, packages=dict(packages), **facts)
+    _check_parts(robot, model)
+    return robot
+
+
+def _check_parts(robot: RobotDescription, model: Model) -> None:
+    """Raise `CallerError` if the description names a link or a joint that its model lacks, or has no drive."""
+    if not isinstance(robot.drive, Drive):
+        raise CallerError(f"the drive of {robot.name!r} must be a Drive, got {robot.drive!r}")
+    arms = robot.arms.values()
+    links = [robot.camera_link or "", *(each for arm in arms for each in (arm.base_link, arm.tool_frame))]
+    joints = [robot.torso_joint or "", *robot.head_joints, *(each for arm in arms for each in arm.joints)]
+    for positions in (*robot.postures.values(), *(arm.park for arm in arms)):
+        joints += positions
+    for arm in arms:
+        joints += itertools.chain.from_iterable(arm.gripper_joints.values())
+    for kind, names, known in (("link", links, model.links), ("joint", joints, model.joints)):
+        for name in filter(None, names):
+            if name not in known:
+                raise CallerError(f"the description of {robot.name!r} names a {kind} {name!r} that its URDF lacks")
 
 
 def describe_arm(

@@ -9,6 +9,7 @@ import struct
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.query.again import world_of
 from pycrorm_async.query.scene import link_poses, object_model
 from pycrorm_async.world import (
+    ArmDescription,
     Arms,
     BulletWorld,
     GripperState,
@@ -427,6 +429,34 @@ def test_a_damaged_collision_mesh_is_refused_with_its_link_and_file(world: Bulle
 
 
 # --- descriptions ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("facts", "reason"),
+    [
+        ({"torso_joint": "lift"}, "names a joint 'lift' that its URDF lacks"),
+        ({"head_joints": ("hinge", "tilt")}, "names a joint 'tilt'"),
+        ({"camera_link": "eye"}, "names a link 'eye'"),
+        ({"postures": {"carry": {"hinge": 0, "knee": 1}}}, "names a joint 'knee'"),
+        ({"arms": {Arms.LEFT: ArmDescription(joints=("hinge",), tool_frame="hand")}}, "names a link 'hand'"),
+        ({"drive": "FIXED"}, "the drive of 'r' must be a Drive, got 'FIXED'"),
+        ({"srdf": "<robot/>", "park": "rest"}, "the SRDF of 'r' has no state 'rest'; its states are: none"),
+    ],
+)
+def test_a_description_that_does_not_fit_its_model_is_refused_when_it_is_made(
+    facts: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(CallerError, match=reason):
+        describe_robot("r", hinge(), **facts)
+
+
+def test_a_model_that_cannot_be_read_is_refused_with_its_file_when_the_robot_is_described(tmp_path: Path) -> None:
+    with pytest.raises(DescriptionNotLoadable, match=r"'r' cannot be loaded: .*/none\.urdf cannot be read"):
+        describe_robot("r", tmp_path / "none.urdf")
+    (tmp_path / "r.urdf").write_text(hinge(axis="0 0 up"))
+    with pytest.raises(DescriptionNotLoadable, match=r"/r\.urdf: joint 'hinge': <axis xyz="):
+        describe_robot("r", tmp_path / "r.urdf")
+
 
 DOG = """<robot name="dog"><link name="base"/><link name="thigh"/><link name="foot"/><link name="upper"/>
 <link name="hand"/><link name="one"/><link name="two"/>
