@@ -22,6 +22,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
+from urllib.parse import unquote
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 from xml.sax.saxutils import quoteattr
 
@@ -209,9 +210,10 @@ def urdf_text(name: str, description: str | Path, packages: Mapping[str, str | P
             object of one link.
         packages: folders of ROS packages by their names.
 
-    `package://x/y` is searched in the folder `packages["x"]`, as `x/y` in the file's folder and those above it, and in
-    the packages that ROS_PACKAGE_PATH and AMENT_PREFIX_PATH list. Other relative names start at the file's folder. For
-    URDF text, which has no file, the current folder takes that place.
+    `package://x/y` is searched in the folder `packages["x"]`, as `x/y` in the file's folder and those above it, in the
+    one of them whose package.xml has that name, and in the packages that ROS_PACKAGE_PATH and AMENT_PREFIX_PATH list.
+    Other relative names start at the file's folder. For URDF text, which has no file, the current folder takes that
+    place. A name may be percent-encoded.
 
     Raises:
         DescriptionNotLoadable: the URDF has a fault, which the message names. Two roots or two joints of one name would
@@ -281,14 +283,17 @@ def _find_mesh(reference: str, folder: Path, packages: Mapping[str, str | Path])
     if mark and scheme in ("package", "model"):
         folders = [folder, *folder.parents]
         places = [Path(packages[package])] if package in packages else [above / package for above in folders]
-        candidates: Iterator[Path] = (each / inside for group in (places, _ros_packages(package)) for each in group)
+        named = (above for above in folders if _is_package(above, package))
+        groups = places, named, _ros_packages(package)
+        candidates: Iterator[Path] = (each / inside for group in groups for each in group)
         hint = "" if package in packages else f"; name its folder with packages={{{package!r}: …}}"
     else:
         candidates = iter([folder / (rest if mark and scheme == "file" else reference)])
     tried: list[str] = []
     for candidate in candidates:
-        if candidate.is_file():
-            return candidate.absolute()
+        for path in (candidate, Path(unquote(str(candidate)))):
+            if path.is_file():
+                return path.absolute()
         tried.append(str(candidate))
     raise UrdfFault(f"mesh {reference} is not at {' nor at '.join(tried[:3])}{hint}")
 
@@ -303,6 +308,17 @@ def _ros_packages(package: str) -> Iterator[Path]:
         yield place / package
         for depth in ("*", "*/*"):  # a workspace with repositories of several packages
             yield from (each.parent for each in place.glob(f"{depth}/{package}/package.xml"))
+        for depth in ("*", "*/*", "*/*/*"):  # a folder may have another name than its package
+            yield from (each for each in place.glob(depth) if _is_package(each, package))
+
+
+def _is_package(folder: Path, name: str) -> bool:
+    """Return whether a folder has a package.xml with this name of a package."""
+    try:
+        text = (folder / "package.xml").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    return re.search(rf"<name>\s*{re.escape(name)}\s*</name>", text) is not None
 
 
 # === parsing ==================================================================================================

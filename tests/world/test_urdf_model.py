@@ -409,6 +409,23 @@ def test_packages_are_found_by_name_and_by_the_variables_of_ros(
         assert found.description_text == by_name.description_text
 
 
+def test_a_package_has_the_name_that_its_package_xml_gives_it(
+    world: BulletWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "src/repository/parts-2.1"
+    (package / "meshes").mkdir(parents=True)
+    (package / "meshes/a part.stl").write_bytes(mesh_files.binary_stl())
+    (package / "package.xml").write_text('<?xml version="1.0"?><package format="3">\n<name> parts </name></package>')
+    text = meshed("package://parts/meshes/a%20part.stl")
+    (package / "urdf").mkdir()
+    (package / "urdf/robot.urdf").write_text(text)
+    inside = Object("inside", ObjectType.ROBOT, package / "urdf/robot.urdf")
+    with pytest.raises(DescriptionNotLoadable, match="name its folder with packages="):
+        Object("elsewhere", ObjectType.ROBOT, text)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "src"))
+    assert Object("elsewhere", ObjectType.ROBOT, text).description_text == inside.description_text
+
+
 def test_a_mesh_file_is_an_object_and_is_read_again_when_it_changes(world: BulletWorld, tmp_path: Path) -> None:
     file = tmp_path / "milk.stl"
     file.write_bytes(mesh_files.binary_stl())
