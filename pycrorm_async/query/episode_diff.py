@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 import msgspec
 from sqlalchemy import Select, func, select
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import Object, Pose, ProcessMetaData
 from pycrorm_async.query.frames import imported
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, nodes_of
@@ -186,8 +187,15 @@ class AlignedRuns:
 
 
 async def align_runs(reading: EpisodeReader, episodes: Sequence[AskedEpisode]) -> AlignedRuns:
-    """Align the trees of several runs of one plan; nodes correspond as in a diff. Raises `UnknownEpisode`."""
+    """Align the trees of several runs of one plan; nodes correspond as in a diff.
+
+    Raises `UnknownEpisode`, and `CallerError` for three or more that are the same one.
+    """
     runs = {each.number: each for each in [await reading.episode(episode_name(each)) for each in episodes]}
+    if len(runs) == 1 and len(episodes) > 2:
+        raise CallerError(
+            f"all {len(episodes)} episodes are episode {next(iter(runs))}: name others to compare it with"
+        )
     by_number = {number: _by_path(await reading.tree(each)) for number, each in runs.items()}
     nodes = [
         AlignedNode(

@@ -93,6 +93,12 @@ def test_the_page_of_two_episodes_marks_what_differs_in_aligned_trees(
             assert tab.problems() == []
 
 
+def test_runs_that_are_one_episode_are_refused(url: str, tmp_path: Path) -> None:
+    reason = "pycrorm: all 3 episodes are episode 1: name others to compare it with\n"
+    assert diff(url, 1, 1, 1) == (2, reason)
+    assert diff(url, 1, 1, 1, "--html", tmp_path / "diff.html") == (2, reason)
+
+
 def test_more_episodes_are_the_nodes_at_which_they_part(url: str) -> None:
     code, text = diff(url, 1, 2, 3, 4, "--json")
     assert code == 0
