@@ -227,7 +227,7 @@ def _repair_document(
     finished: Sequence[Path], repaired: Sequence[maintenance.RepairReport], refused: dict[str, PycrormError]
 ) -> dict[str, object]:
     return {
-        "mended": [asdict(each) | {"complete": each.complete} for each in repaired],
+        "repaired": [asdict(each) | {"complete": each.complete} for each in repaired],
         "finished": [path.name for path in finished],
         "refused": {name: str(error) for name, error in refused.items()},
     }

@@ -95,7 +95,7 @@ def test_a_damaged_spool_is_repaired_and_its_whole_records_are_stored(left: Path
     assert line.endswith(f"; repair it with: pycrorm spool repair {left}")
 
     document = answer("spool", "repair", left, cwd=left.parent, code=1)
-    [repaired] = document["mended"]
+    [repaired] = document["repaired"]
     assert Path(repaired["set_aside"], path.name).read_bytes()[at : at + 1] == b"#"
     assert len(repaired["unreadable"]) == 1
     [[first, last]] = repaired["unreadable"]
