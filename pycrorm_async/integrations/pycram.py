@@ -144,7 +144,7 @@ KNOWN_VERSIONS: Final = ("1.0.4",)
 """The versions of the distribution `pycram-robotics` whose methods this module replaces."""
 _PYCRAM: Final = ForeignPackage("PyCRAM", extra="pycram", versions=KNOWN_VERSIONS)
 _SETTINGS: Final = Settings(fold="at_end", sync_interval_ms=250)
-_ACTIVE: Final[set[int]] = set()
+_ACTIVE: Final[dict[int, object]] = {}
 """The processes with an active `remember`: only one in each, because it replaces methods, also in a forked child."""
 
 
@@ -173,9 +173,8 @@ def remember(
     """
     _PYCRAM.check_version(_PYCRAM.installed_version("pycram-robotics"))
     process = os.getpid()
-    if process in _ACTIVE:
+    if _ACTIVE.setdefault(process, token := object()) is not token:  # one call, so that no other thread comes between
         raise CallerError("another `remember` is active in this process: leave its block, or perform inside it")
-    _ACTIVE.add(process)
     try:
         labels = {"description": description, "plan": plan, "seed": seed, "tags": tags, "metadata": metadata}
         with (
@@ -184,7 +183,7 @@ def remember(
         ):
             yield episode
     finally:
-        _ACTIVE.discard(process)
+        del _ACTIVE[process]
 
 
 class _PyCRAMPlans:
