@@ -37,7 +37,7 @@ from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm.base import EnumName, JsonText, UtcTime
 from pycrorm_async.orm.rows import ClassOfRow
 from pycrorm_async.projections.derived_views import member
-from pycrorm_async.query.text import nearest
+from pycrorm_async.query.text import distinct, nearest
 from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
@@ -325,7 +325,9 @@ def select_of(query: object) -> sa.Select[*tuple[Any, ...]]:
 
 def columns_of(statement: sa.Select[*tuple[Any, ...]], *, deferred: bool = False) -> list[FrameColumn]:
     """Return the columns of a select over columns, mapped classes, views, or a mix; with `deferred`, those too."""
-    return list(_distinct(_columns(statement, deferred=deferred)))
+    columns = list(_columns(statement, deferred=deferred))
+    names = distinct([each.name for each in columns])
+    return [each._replace(name=name) for each, name in zip(columns, names, strict=True)]
 
 
 def _columns(statement: sa.Select[*tuple[Any, ...]], *, deferred: bool) -> Iterator[FrameColumn]:
@@ -368,13 +370,6 @@ def _is_mean(expression: Any) -> bool:
     while (inner := getattr(expression, "element", None)) is not None:
         expression = inner
     return isinstance(expression, FunctionElement) and getattr(expression, "name", "") == "avg"
-
-
-def _distinct(columns: Iterator[FrameColumn]) -> Iterator[FrameColumn]:
-    seen: dict[str, int] = {}
-    for each in columns:
-        count = seen[each.name] = seen.get(each.name, -1) + 1
-        yield each._replace(name=f"{each.name}_{count}") if count else each
 
 
 # === dataframe ================================================================================================

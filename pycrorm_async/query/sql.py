@@ -31,12 +31,13 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppres
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import QueryRefused
-from pycrorm_async.query.text import NotebookValue, nearest
+from pycrorm_async.query.text import NotebookValue, distinct, nearest
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA, VIEWS_SCHEMA
 
@@ -310,18 +311,20 @@ class SqlResult(NotebookValue):
     @property
     def names(self) -> list[str]:
         """The columns' names, the second `x` as `x_1`, as frames have them."""
-        times: dict[str, int] = {}
-        names = []
-        for name in self.columns:
-            times[name] = times.get(name, -1) + 1
-            names.append(f"{name}_{times[name]}" if times[name] else name)
-        return names
+        return distinct(self.columns)
 
     def frame(self) -> pd.DataFrame:
-        """Return the rows as a frame of pandas, which derives the types from the values. Raises `MissingExtra`."""
+        """Return the rows as a frame of pandas, which derives the types from the values. Raises `MissingExtra`.
+
+        Integers of which some are null are Int64, because pandas would make floats of them, which lose digits.
+        """
         from pycrorm_async.query.frames import imported
 
-        frame: pd.DataFrame = imported("pandas").DataFrame(self.rows, columns=self.names)
+        pandas = imported("pandas")
+        frame: pd.DataFrame = pandas.DataFrame(self.rows, columns=self.names)
+        for name, values in zip(self.names, zip(*self.rows, strict=True), strict=False):
+            if {type(each) for each in values} == {int, NoneType}:
+                frame[name] = pandas.array(values, dtype="Int64")
         return frame
 
 

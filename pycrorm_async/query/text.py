@@ -87,6 +87,22 @@ def node_text(node: Any) -> str:
     return " ".join(parts)
 
 
+def distinct(names: Sequence[str]) -> list[str]:
+    """Return the names of columns, each of them once: a number follows a name that came before.
+
+    >>> distinct(["x", "x", "x_1"])
+    ['x', 'x_2', 'x_1']
+    """
+    distinct_names: dict[str, None] = {}
+    for name in names:
+        number, unique = 0, name
+        while unique in distinct_names or (number and unique in names):
+            number += 1
+            unique = f"{name}_{number}"
+        distinct_names[unique] = None
+    return list(distinct_names)
+
+
 def one_line(text: object, characters_max: int | None) -> str:
     """Format a text on one line; an ellipsis marks the cut."""
     line = " ".join(str(text).split())

@@ -16,7 +16,7 @@ import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.sql import ReadOnlySql, SqlLimits, json_rows
+from pycrorm_async.query.sql import ReadOnlySql, SqlLimits, SqlResult, json_rows
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import OWNER_GRANTS
@@ -278,6 +278,15 @@ async def test_a_query_returns_its_columns_and_rows(sql: SqlReader, reader_url: 
         frame = (await reading.query("SELECT id AS n, status, id AS n FROM process_metadata ORDER BY id")).frame()
     assert [*frame.columns] == ["n", "status", "n_1"]
     assert frame.n.tolist() == [1, 2]
+
+
+async def test_a_frame_of_sql_keeps_each_column_and_each_digit(sql: SqlReader) -> None:
+    text = f"SELECT 1 AS x, 2 AS x, 3 AS x_1, {2**53 + 1} AS big UNION SELECT 4, 5, 6, NULL"
+    result = SqlResult(*await sql.query(text))
+    frame = result.frame().sort_values("x")
+    assert [*frame.columns] == ["x", "x_2", "x_1", "big"]
+    assert frame.iloc[0].tolist() == [1, 2, 3, 2**53 + 1]
+    assert str(frame.big.dtype) == "Int64"
 
 
 async def test_rows_are_the_same_json_on_both_databases(sql: SqlReader) -> None:
