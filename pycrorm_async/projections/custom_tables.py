@@ -235,6 +235,8 @@ class CustomTables:
                 events = await runner.fold_next()
                 count += events is not None
                 most_events = max(most_events, events or 0)
+                if (events or 0) < checkpoints.LOOKAHEAD_EVENTS_MIN:
+                    await target.mark()
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:

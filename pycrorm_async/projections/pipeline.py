@@ -52,6 +52,7 @@ from sqlalchemy import TableClause, column, or_, select, table, text, update
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged, PycrormError
+from pycrorm_async.events.ids import NUMBER_SHIFT, SEQUENCE_MAX, row_id_min
 from pycrorm_async.events.types import Happening
 from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import Layout, Storage, physical_name, unite
@@ -472,7 +473,8 @@ async def sweep(log: EventLog) -> None:
 
 TABLE = "pycrorm_progress"
 COLUMNS: dict[str, Storage] = {"id": "key", "folded": "integer", "parked": "text"}
-"""The episode's number, the last sequence that is in the tables, and the reason if it is parked."""
+"""The episode's number, the last sequence that is in the tables, and the reason if it is parked. A row without an
+episode, whose id is not above 0, is a mark (section "targets")."""
 SEEN = "SELECT number, folded FROM episode"
 """SQL that selects, for each episode, the last sequence in the visible tables."""
 
@@ -490,25 +492,28 @@ async def episodes_behind(
     after: int = 0,
     share: tuple[int, int] = (0, 1),
     after_tables: bool = False,
+    newer: int = 0,
     seen: str | None = None,
 ) -> list[EpisodeRow]:
     """Return the episodes above number `after` whose log is ahead of their checkpoint, limited to one share.
 
     With `after_tables`, only episodes whose first event is folded into the visible tables or parked, because that fold
-    decides whether an episode is a simulation. With `seen`, the SQL for the checkpoints of the visible tables (`SEEN`,
-    or `folded` of another generation), those of which the visible tables have more events; these are their `head`.
+    decides whether an episode is a simulation. With `newer`, only those with an event of a higher rowid. With `seen`,
+    the SQL for the checkpoints of the visible tables (`SEEN`, or `folded` of another generation), those of which the
+    visible tables have more events; these are their `head`.
     """
     head, joined = (
         ("head", "") if seen is None else ("seen.folded", f"JOIN ({seen}) AS seen ON seen.number = episode.number")
     )
     begun = "AND (episode.folded > 0 OR episode.parked IS NOT NULL)" if after_tables else ""
+    grown = "AND episode.number IN (SELECT episode FROM event WHERE rowid > :newer)" if newer else ""
     rows = await connection.execute(
         text(f"""
 SELECT episode.number, {dialect_of(connection).episode_id}, {head}, coalesce(progress.folded, 0), started_wall_ns
 FROM episode {joined} LEFT JOIN {place} AS progress ON progress.id = episode.number
 WHERE episode.number > :after AND {head} > coalesce(progress.folded, 0) AND progress.parked IS NULL
-AND episode.number % :many = :part {begun} ORDER BY episode.number LIMIT :limit"""),  # noqa: S608
-        {"after": after, "part": share[0], "many": share[1], "limit": limit},
+AND episode.number % :many = :part {begun} {grown} ORDER BY episode.number LIMIT :limit"""),  # noqa: S608
+        {"after": after, "part": share[0], "many": share[1], "limit": limit, "newer": newer},
     )
     return [EpisodeRow(*row) for row in rows]
 
@@ -602,6 +607,14 @@ def _table(place: str) -> TableClause:
 # into `episode.folded` when it switches. No index leads from it to the episodes that are behind, so a custom projection
 # checks all episodes at intervals (`custom_tables`).
 #
+# On SQLite the checkpoints of a custom projection have one more row, its mark: the newest event such that it and all
+# that were stored before are folded or belong to parked episodes. Events are stored in the order of their rowids, so
+# only episodes with an event behind the mark have to be checked. The mark stays true: checkpoints never go back, a
+# parked episode stays so, and a rebuild begins a table without a mark. Only a removal takes checkpoints away, of an
+# episode that may be restored, and it raises the revision of each generation. So the mark belongs to one revision. It
+# names the event and not its rowid, because a rowid may be given again, and may change when the file is written anew.
+# `mark` moves it only where many events are behind it, because that takes a transaction.
+#
 # `SideTarget` reads the generation under its key in every transaction. For a rebuild another number is an error. For a
 # projection it means that another process has rebuilt it: a batch folded for the old tables is folded again for the new
 # ones, unless their version differs, which is an error. Several workers may fill one generation, each its `Share` of
@@ -611,6 +624,11 @@ _log = logging.getLogger("pycrorm_async.projections")
 
 _BEHIND_EPISODES_MAX = 400
 """Bounds the episodes in one batch, because reading each of them costs as much as folding some of its events."""
+_UNMARKED_EVENTS_MIN: Final = 10_000
+"""The events behind a mark from which on it is moved: to check their episodes takes 1 ms."""
+_CHECKED_EVENTS_MAX: Final = 3
+"""Bounds the events behind a mark whose episodes are checked, per episode of the memory: with more of them, checking
+all episodes is faster."""
 
 
 class Share(NamedTuple):
@@ -717,9 +735,10 @@ class SideTarget:
         self.share = share
         self._place = ""
         self._known: generations.Generation | None = None
+        self._unmarked = 0  # the events behind the mark, at the last check
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
-        await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
+        generation = await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
         return await episodes_behind(
             connection,
             self._place,
@@ -727,7 +746,46 @@ class SideTarget:
             limit=min(limit, _BEHIND_EPISODES_MAX),
             share=self.share,
             after_tables=self._projection is not None,
+            newer=(await self._marked(connection, generation))[1],
         )
+
+    async def _marked(self, connection: AsyncConnection, generation: generations.Generation) -> tuple[int, int]:
+        """Return the rowid of the mark, 0 without one, and the rowid above which episodes have to be checked."""
+        if self._projection is None or not self.log.address.is_sqlite:
+            return 0, 0
+        key = f"event.episode = folded >> {NUMBER_SHIFT} AND event.sequence = folded >> 5 & {SEQUENCE_MAX}"
+        query = text(f"""
+SELECT coalesce(max(rowid), 0), (SELECT max(number) FROM episode),
+coalesce((SELECT event.rowid FROM {self._place} AS mark JOIN event ON {key} WHERE mark.id = :mark), 0) FROM event
+""")  # noqa: S608
+        newest, episodes, marked = (await connection.execute(query, {"mark": -generation.revision})).one()
+        self._unmarked = newest - marked
+        return marked, marked if self._unmarked <= _CHECKED_EVENTS_MAX * (episodes or 0) else 0
+
+    async def mark(self) -> None:
+        """Move the mark of this custom projection as far as possible, if many events are behind it."""
+        if self._unmarked < _UNMARKED_EVENTS_MIN:
+            return
+        async with self.log.snapshot() as connection:
+            generation = await self.generation(connection, None)
+            marked, newer = await self._marked(connection, generation)
+            behind = await episodes_behind(connection, self._place, limit=_BEHIND_EPISODES_MAX, newer=newer)
+            lacking = ", ".join(f"({each.number}, {each.folded + 1})" for each in behind) or "(0, 0)"
+            query = f"SELECT count(*), min(rowid) FROM event WHERE (episode, sequence) IN (VALUES {lacking})"  # noqa: S608
+            count, first = (await connection.execute(text(query))).one()
+            query = "SELECT rowid, episode, sequence FROM event WHERE rowid < :first ORDER BY rowid DESC LIMIT 1"
+            last = (await connection.execute(text(query), {"first": first or 2**63 - 1})).first()
+        # If the projection is far behind, it is marked later. An event that it lacks may be missing in the log.
+        if last is None or len(behind) == _BEHIND_EPISODES_MAX or count < len(behind):
+            return
+        rowid, number, sequence = last
+        if rowid < marked + _UNMARKED_EVENTS_MIN:
+            return
+        async with self.log.writing() as connection:
+            if (await self.generation(connection, "share")).number == generation.number:
+                await connection.execute(text(f"DELETE FROM {self._place} WHERE id <= 0"))  # noqa: S608
+                insert = text(f"INSERT INTO {self._place} (id, folded) VALUES (:mark, :key)")  # noqa: S608
+                await connection.execute(insert, {"mark": -generation.revision, "key": row_id_min(number, sequence)})
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
         if not await advance(connection, self._place, steps, parked):

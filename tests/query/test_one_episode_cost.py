@@ -13,11 +13,13 @@ from pathlib import Path
 import pytest
 
 from bench.one_episode import WRITING, Steps, fill, questions_of, rows_read
+from pycrorm_async.projections import pipeline
 from tests.databases import Server, ask_to_change, put_memory, run_in_own_loop
 
 FEW = 50
-OF_ALL = {"copy in", "list"}
-"""The fold of recall looks at the checkpoint of each episode of the memory that it folds into; a list has many."""
+OF_ALL = {"sqlite": {"list"}, "postgresql": {"list", "copy in", "recall", *WRITING}}
+"""A list has many episodes. On PostgreSQL the fold of recall looks at the checkpoint of each one, a recall reads the
+numbers of up to 15 blocks of each level, and the rows that a writing statement reads cannot be counted."""
 RATIO_MAX = 1.5
 SLACK = 10
 """Units of work that a deeper index may cost."""
@@ -47,8 +49,9 @@ def few_and_many(request: pytest.FixtureRequest, many: int, tmp_path: Path) -> I
     "many", [pytest.param(1_500, marks=pytest.mark.slow), pytest.param(5_000, marks=pytest.mark.soak)]
 )
 async def test_a_question_about_one_episode_costs_the_same_however_many_episodes_there_are(
-    few_and_many: dict[int, str], tmp_path: Path
+    few_and_many: dict[int, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pipeline, "_UNMARKED_EVENTS_MIN", 100)  # as among more episodes, of which so many are few
     work: dict[str, list[int]] = {}
     for size, url in few_and_many.items():
         folder = tmp_path / f"files of {size}"
@@ -56,7 +59,7 @@ async def test_a_question_about_one_episode_costs_the_same_however_many_episodes
         with Steps() as steps:
             async with questions_of(url, size // 2, folder) as questions:
                 for name, question in questions.items():
-                    if name in OF_ALL or (name in WRITING and url.startswith("postgresql")):
+                    if name in OF_ALL[url.partition(":")[0].partition("+")[0]]:
                         continue
                     await question()  # the first time it may learn declarations
                     if url.startswith("postgresql"):
