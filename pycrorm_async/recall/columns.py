@@ -131,13 +131,16 @@ class Column:
         return mask
 
     def count(self, word: str) -> int:
-        """Return the number of cases that have the word."""
-        return sum(self._counts[code] for code in self.words.codes_by_word.get(word, ()))
+        """Return the number of cases that have the word, which is counted once: most words are never asked for."""
+        if word not in self.words.codes_by_word:
+            return 0
+        if word not in self._counts:
+            self._counts[word] = int(np.count_nonzero(self.having(word)))
+        return self._counts[word]
 
     @cached_property
-    def _counts(self) -> list[int]:
-        counts: list[int] = np.bincount(self.values, minlength=len(self.words) + 1).tolist()
-        return counts
+    def _counts(self) -> dict[str, int]:
+        return {}
 
     @cached_property
     def summary(self) -> Summary | None:

@@ -153,9 +153,10 @@ def _parts(group: Group, cue: Cue) -> Iterator[slice]:
 
 def _matches(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Match]:
     """Return the best `k` cases of these rows from a score on; none has a score above `bound`."""
-    steps = np.rint(_similarity(group, rows, cue, weights) / weights.total * _STEPS).astype(np.int64)
+    places, similarity = _similarity(group, rows, cue, weights, lowest)
+    steps = np.rint(similarity / weights.total * _STEPS).astype(np.int64)
     for condition in _conditions(group, rows, cue):
-        steps[~condition] = -1
+        steps[~condition[places]] = -1
     chosen = np.flatnonzero(steps == bound)[: cue.k]  # the newest of equal ones come first
     if chosen.size < cue.k:
         chosen = np.flatnonzero(steps >= lowest)
@@ -164,33 +165,51 @@ def _matches(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int,
             limit = np.partition(scores, scores.size - cue.k)[scores.size - cue.k]
             above, equal = chosen[scores > limit], chosen[scores == limit]
             chosen = np.concatenate([above, equal[: cue.k - above.size]])
-    places = rows.start + chosen
-    columns = steps[chosen].tolist(), group.started_us[places].tolist(), group.nodes[places].tolist(), places.tolist()
+    scores, places = steps[chosen], np.arange(rows.start, rows.stop)[places][chosen]
+    columns = scores.tolist(), group.started_us[places].tolist(), group.nodes[places].tolist(), places.tolist()
     return [Match(score, started, node, group, row) for score, started, node, row in zip(*columns, strict=True)]
 
 
-def _similarity(group: Group, rows: slice, cue: Cue, weights: Weights) -> NDArray[np.float64]:
-    """Return the weighted similarity of each row; the terms are added in the order of the cue."""
+def _similarity(
+    group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int
+) -> tuple[slice | NDArray[np.int64], NDArray[np.float64]]:
+    """Return the weighted similarity of those of the rows that can have a score of `lowest`, and their places.
+
+    The terms are added in the order of the cue. The numbers are compared only of rows whose words leave that score
+    possible, if these are fewer than half.
+    """
     if not (cue.has or cue.near):
-        return np.ones(rows.stop - rows.start)
+        return slice(None), np.ones(rows.stop - rows.start)
     total = np.zeros(rows.stop - rows.start)
     for pair, weight in zip(cue.has, weights.words, strict=True):
         column = group.texts.get(pair[0])
         if column is not None and pair[1] in column.words.codes_by_word:
             total += column.having(pair[1], rows) * weight
+    places: slice | NDArray[np.int64] = slice(None)
+    needed = (lowest - 1) / _STEPS * weights.total
+    left = sum(each.feature in group.numbers for each in cue.near)
     for wanted, tolerance in zip(cue.near, weights.tolerances, strict=True):
         numbers = group.numbers.get(wanted.feature)
-        if numbers is not None:
-            total += _nearness(numbers.values[rows], wanted, tolerance)
-    return total
+        if numbers is None:
+            continue
+        possible = np.flatnonzero(total >= needed - left)
+        if 2 * possible.size < total.size:
+            places, total = possible if isinstance(places, slice) else places[possible], total[possible]
+        total += _nearness(numbers.values[rows][places], wanted, tolerance)
+        left -= 1
+    return places, total
 
 
 def _nearness(values: NDArray[np.floating], wanted: Wanted, tolerance: float) -> NDArray[np.float64]:
-    distances = np.abs(values.astype(np.float64) - wanted.value)
+    near = values.astype(np.float64)
+    near -= wanted.value
+    np.abs(near, out=near)
     if is_angle(wanted.feature):
-        distances = np.fmod(distances, math.tau)
-        distances = np.minimum(distances, math.tau - distances)
-    return np.nan_to_num(np.maximum(1 - distances / tolerance, 0.0), copy=False)
+        np.fmod(near, math.tau, out=near)
+        near = np.minimum(near, math.tau - near)
+    near /= -tolerance
+    near += 1
+    return np.fmax(near, 0.0, out=near)  # 0 where the case has no number
 
 
 def _reachable(group: Group, cue: Cue, weights: Weights) -> float:
