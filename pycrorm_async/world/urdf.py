@@ -437,7 +437,7 @@ def describe_robot(
         for state in semantics.findall("group_state"):
             if positions := _positions(name, state, model):
                 postures.setdefault(state.get("name", ""), {}).update(positions)
-        _log_unknown(name, semantics, model)
+        _log_faults(name, semantics, model, postures)
         if park not in {"park", *postures}:
             raise CallerError(
                 f"the SRDF of {name!r} has no state {park!r}; its states are: {', '.join(postures) or 'none'}"
@@ -576,6 +576,8 @@ def _spread(model: Model, palm: str, tool: str, fingers: Sequence[Joint]) -> Cal
 
 # --- SRDF ------------------------------------------------------------------------------------------------------
 
+_ROUNDED = 1e-6
+"""A position that is outside its limits by no more is a rounded one, rad or m, and can be set."""
 _LEG = re.compile(r"(?<![a-z])(?:[lr]|[lr][fhr]|[fhr][lr])?(?:leg|foot|feet|sole|ankle|toe|wheel)s?(?![a-z])")
 _SIDES = (
     (re.compile(r"left|(?<![a-z])l(?![a-z])"), Arms.LEFT),
@@ -585,25 +587,42 @@ _STATES = {GripperState.OPEN: ("open", "opened"), GripperState.CLOSE: ("close", 
 
 
 def _positions(name: str, state: Element, model: Model) -> dict[str, float]:
-    """Return the positions of a state for the joints of the URDF that move. Raises `CallerError` for other words."""
+    """Return the positions of a state for joints of the URDF that move freely. Raises `CallerError` for other words.
+
+    A follower gives its leader's position where the state has none for that.
+    """
     positions: dict[str, float] = {}
+    of_leaders: dict[str, float] = {}
     for each in state.findall("joint"):
         joint = model.joints.get(each.get("name", ""))
         if joint is None or joint.kind is JointType.FIXED:
             continue
         try:
-            positions[joint.name] = number_of(each.get("value", ""))
-            if not math.isfinite(positions[joint.name]):
+            position = number_of(each.get("value", ""))
+            if not math.isfinite(position):
                 raise ValueError(f"{each.get('value')!r} is not finite")  # noqa: TRY301  a fault like the others
         except ValueError as fault:
             raise CallerError(
                 f"the SRDF of {name!r}: <group_state name={state.get('name', '')!r}>, joint {joint.name!r}: {fault}"
             ) from None
-    return positions
+        if joint.mimic is None:
+            positions[joint.name] = position
+        elif joint.mimic.multiplier:
+            of_leaders[joint.mimic.joint] = (position - joint.mimic.offset) / joint.mimic.multiplier
+    return of_leaders | positions
 
 
-def _log_unknown(name: str, semantics: Element, model: Model) -> None:
-    """Log the joints of states that the URDF lacks, but for those of a floating base, which have several numbers."""
+def _log_faults(name: str, semantics: Element, model: Model, postures: Mapping[str, Mapping[str, float]]) -> None:
+    """Log states that no robot can take, and joints that the URDF lacks.
+
+    The joints of a floating base, which have several numbers, are not logged.
+    """
+    for state, positions in postures.items():
+        for joint, position in positions.items():
+            lower, upper = model.joints[joint].bounds
+            if not lower - _ROUNDED <= position <= upper + _ROUNDED:
+                at = f"{joint} at {position:g}, outside its limits {lower:g} to {upper:g}"
+                _log.warning("the SRDF of %r: the state %r puts %s", name, state, at)
     states = semantics.iterfind("group_state/joint")
     named = dict.fromkeys(each.get("name", "") for each in states if len(each.get("value", "").split()) < 2)
     if unknown := [each for each in named if each not in model.joints]:

@@ -475,6 +475,23 @@ def test_a_model_that_cannot_be_read_is_refused_with_its_file_when_the_robot_is_
         describe_robot("r", tmp_path / "r.urdf")
 
 
+def test_a_state_of_followers_alone_moves_their_leader(world: BulletWorld) -> None:
+    state = '<group_state name="{name}" group="hand"><joint name="{joint}" value="{value}"/>{more}</group_state>'
+    both = state.format(name="both", joint="follower", value="9", more='<joint name="drive" value="0.04"/>')
+    srdf = f"<robot>{state.format(name='half', joint='second', value='0.04', more='')}{both}</robot>"
+    robot = describe_robot("gripper", GRIPPER, srdf=srdf)
+    gripper = Object("gripper", ObjectType.ROBOT, robot=robot)
+    assert robot.postures == {"half": {"drive": pytest.approx(0.02)}, "both": {"drive": 0.04}}
+    gripper.set_joint_positions(robot.postures["half"])
+    assert gripper.joint_position("second") == pytest.approx(0.04)
+
+
+def test_a_state_outside_the_limits_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    srdf = '<robot><group_state name="up" group="arm"><joint name="hinge" value="3"/></group_state></robot>'
+    describe_robot("r", hinge(), srdf=srdf)
+    assert "the SRDF of 'r': the state 'up' puts hinge at 3, outside its limits -1 to 1" in caplog.text
+
+
 DOG = """<robot name="dog"><link name="base"/><link name="thigh"/><link name="foot"/><link name="upper"/>
 <link name="hand"/><link name="one"/><link name="two"/>
 <joint name="hip" type="revolute"><parent link="base"/><child link="thigh"/><limit lower="-1" upper="1"/></joint>
