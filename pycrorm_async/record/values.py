@@ -528,7 +528,9 @@ class ValueReader:
         if isinstance(value, str | int | float):
             return _require_writable(_as_built_in(value))
         if _is_numpy(value, "generic"):
-            return self.read(value.item(), path, depth + 1)
+            plain = value.item()
+            is_wide = type(plain) is kind and value.dtype.kind == "f"  # a `longdouble`, which is not a Python float
+            return self.read(float(plain) if is_wide else plain, path, depth + 1)
         if isinstance(value, event_types.Blob):
             return self._blob(value)
         if _is_numpy(value, "ndarray"):

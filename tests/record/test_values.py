@@ -126,6 +126,12 @@ def test_the_recordable_part_of_a_result_is_written() -> None:
     }
 
 
+def test_a_long_double_is_written_as_a_float() -> None:
+    assert encode_or_missing({"a": np.longdouble("0.5"), "b": [np.longdouble(1)]}, NOBODY) == {"a": 0.5, "b": [1.0]}
+    missing = encode_or_missing(np.clongdouble(1j), NOBODY)
+    assert isinstance(missing, MissingValue)
+
+
 def test_a_result_of_an_unknown_class_is_missing_with_reason_and_repr() -> None:
     assert encode_or_missing({1, 2}, NOBODY) == MissingValue("JSON cannot hold a set", "{1, 2}")
     assert encode_or_missing(math.nan, NOBODY) == MissingValue("nan is not a finite number", "nan")
