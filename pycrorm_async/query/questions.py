@@ -383,7 +383,7 @@ def _history(name: str, episode: Any) -> Rows:
     return (
         sa.select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
         .outerjoin(_NODE, sa.and_(*of_course, frames.of_episode(_NODE.c.process_metadata_id, episode)))
-        .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
+        .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail.nulls_first())
     )
 
 
@@ -508,7 +508,7 @@ class Ask(Generic[Q]):
                 *(frames.times_with(failed.outcome == each).label(each) for each in OUTCOMES if each != RECOVERED),
             )
             .group_by(*causes)
-            .order_by(sa.func.count().desc(), *causes)
+            .order_by(sa.func.count().desc(), *(each.nulls_first() for each in causes))
         )
         return frames.limited(statement, limit)
 
@@ -634,7 +634,7 @@ class Ask(Generic[Q]):
         }
         columns = [each(node.duration).label(name) for name, each in sums.items()]
         statement = _by_type(episode, columns, dtype=dtype, kind=kind)
-        return frames.limited(statement.order_by(sa.func.sum(node.duration).desc(), node.dtype), limit)
+        return frames.limited(statement.order_by(sa.func.sum(node.duration).desc().nulls_last(), node.dtype), limit)
 
     @_Question
     @staticmethod
@@ -754,7 +754,7 @@ class Ask(Generic[Q]):
                 frames.equal(node.dtype, dtype),
             )
             .group_by(node.dtype, arm)
-            .order_by(sa.func.count().desc(), node.dtype, arm)
+            .order_by(sa.func.count().desc(), node.dtype, arm.nulls_first())
         )
         return frames.limited(statement, limit)
 

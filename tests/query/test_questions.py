@@ -18,7 +18,9 @@ from pycrorm_async.events.types import (
     FailureValue,
     NodeEnded,
     NodeStarted,
+    ObjectAdded,
     ObjectMoved,
+    ObjectReference,
     RobotValue,
 )
 from pycrorm_async.memory import Memory
@@ -29,6 +31,7 @@ from pycrorm_async.world import Pose
 from pycrorm_async.world.pose import Arms, Grasp
 from tests.databases import ask_each
 from tests.projections.event_script import (
+    NAVIGATE,
     PICK_UP,
     T0_NS,
     Script,
@@ -184,6 +187,21 @@ async def test_durations_are_summed_up_for_each_type(reading: Reading, kind: Any
         assert row.failed == sum(each.is_failed for each in own)
         assert (row.total_s, row.shortest_s, row.longest_s) == (sum(took), min(took), max(took))
         assert row.mean_s == pytest.approx(sum(took) / len(took))
+
+
+async def test_a_missing_value_has_the_same_place_in_the_order_on_both_databases(database_url: str) -> None:
+    script = Script(1)
+    script.put(EpisodeStarted("orders", "me", "host", "1", "3.11"))
+    root = script.put(NodeStarted("root"))
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1)))
+    script.put(NodeStarted("action", root, name_of(NAVIGATE)))  # runs, so that its type has no duration
+    for parameters in ({"object_designator": ObjectReference(milk, milk)}, {}):
+        node = script.put(NodeStarted("action", root, name_of(PICK_UP), parameters))
+        script.put(NodeEnded(node, "FAILED", FailureValue("a.IKError", "too far")))
+    await append_and_fold(database_url, [*declarations(NAVIGATE, PICK_UP), *script.records])
+    async with Reading.open(database_url) as reading:
+        assert [each.dtype for each in await reading.ask.durations(limit=1).rows()] == ["PickUpAction"]
+        assert [each.object for each in await reading.ask.failures_by_cause(limit=1).rows()] == [None]
 
 
 async def test_the_uses_of_each_arm_are_counted(reading: Reading) -> None:
