@@ -145,13 +145,13 @@ def _decoded(content: bytes | str) -> Any:
 
 def _parsed_lines(text: str) -> tuple[list[Any], int | None]:
     lines, offset = [], 0
-    for line in text.splitlines(keepends=True):
+    for line in text.split("\n"):  # `splitlines` would also end a line inside a text that has U+2028
         if line.strip():
             try:
                 lines.append(_decoded(line))
             except (ValueError, RecursionError):
                 return lines, offset
-        offset += len(line.encode())
+        offset += len(line.encode()) + 1
     return lines, None
 
 

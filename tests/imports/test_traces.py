@@ -186,7 +186,8 @@ def test_spans_of_opentelemetry_become_one_episode_for_each_trace(tmp_path: Path
         span("BB", "01", "other", 0, None, parentSpanId="ff"),
         span("BB", "01", "twice", 0, 1),
     ]
-    line = json.dumps({"resourceSpans": [{"scopeSpans": [{"spans": spans}]}]})
+    scope = {"name": "a line separator\u2028, as JSON writes it", "version": "\x85"}
+    line = json.dumps({"resourceSpans": [{"scopeSpans": [{"scope": scope, "spans": spans}]}]}, ensure_ascii=False)
     (tmp_path / "spans.jsonl").write_text(line + "\n" + line[:50])
     report = imported(tmp_path, "trace", tmp_path / "spans.jsonl")
     us = AT // 1000
@@ -198,7 +199,7 @@ def test_spans_of_opentelemetry_become_one_episode_for_each_trace(tmp_path: Path
     assert tree(tmp_path / "memory.db", 2) == [("other", None, "action", "UNKNOWN", None, None, us, None)]
     assert {what: count for (what, _), count in report.left_out.items()} == {"parents of spans": 1, "spans": 1}
     [cut] = report.cut
-    assert f"spans.jsonl ends in the middle of a record, at byte {len(line) + 1:,}; what stands before" in cut
+    assert f"spans.jsonl ends in the middle of a record, at byte {len(line.encode()) + 1:,}; what stands before" in cut
 
 
 @pytest.mark.parametrize("rest", ["", ",\n", ',\n{"ph": "X", "na'])
