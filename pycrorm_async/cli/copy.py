@@ -6,6 +6,7 @@ Panel: Hand over, 2.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -14,6 +15,7 @@ from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.output import Form, print_rows, problem
 from pycrorm_async.cli.reading import DEFAULT_URL, Place, SpoolOption
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
+from pycrorm_async.operations.workers import WORKERS, ChildProcess, forked
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.lake import PREFIX
 
@@ -43,7 +45,8 @@ def copy(
     events under one number, 1 if an episode is stopped; all other episodes are copied.
     """
     collect_seldom()
-    summary = asyncio.run(_copy(source, target, episode or []))
+    with forked(WORKERS, target) as processes:
+        summary = asyncio.run(_copy(source, target, episode or [], processes))
     if not source.startswith(PREFIX):
         Place(source, spool).note_pending_events()
     print_rows(
@@ -60,6 +63,6 @@ def copy(
     return 4 if damaged else 1 if stopped else 0
 
 
-async def _copy(source: str, target: str, episodes: list[str]) -> CopySummary:
+async def _copy(source: str, target: str, episodes: list[str], processes: Sequence[ChildProcess]) -> CopySummary:
     with progress_bar("copying") as report_progress:
-        return await copy_episodes(source, target, episodes=episodes, report_progress=report_progress)
+        return await copy_episodes(source, target, episodes=episodes, report_progress=report_progress, forked=processes)

@@ -5,9 +5,13 @@ types, descriptions and blobs that they name. Then its events are read back, and
 the memory. Only then is the episode removed from the memory (`operations.removal`). A process that is killed between
 the two leaves the episode in both, and the next archive finds it in the lake and removes it. One that is killed before
 the commit leaves files that the catalog does not know; an hour later the next archive or erasure deletes them.
+
+While some episodes are added to the lake and read back, those before them are removed from the memory. The lake works
+in a thread, so that the statements of the removal need not wait for it.
 """
 
-from collections.abc import Collection, Sequence
+import asyncio
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from itertools import islice
 from typing import Final, NamedTuple
@@ -69,10 +73,16 @@ async def archive_episodes(
                 rows = [each for each in await log.episodes() if _may_go(each, end_ns)]
                 rows = rows if only is None else [each for each in rows if each.number in only]
                 total, done = sum(each.head for each in rows), 0
-                for some in parts(rows, _EVENTS_AT_ONCE):
-                    await _archive(log, lake, some, reason, summary)
-                    done += sum(each.head for each in some)
-                    report_progress(done, total)
+                removing = asyncio.create_task(_remove(log, lake, (), {}, reason, summary))
+                try:
+                    for some in parts(rows, _EVENTS_AT_ONCE):
+                        digests = await _add_and_compare(log, lake, some, summary)
+                        done += sum(each.head for each in some)
+                        report_progress(done, total)
+                        await removing
+                        removing = asyncio.create_task(_remove(log, lake, some, digests, reason, summary))
+                finally:
+                    await removing
                 lake.clear_orphans()
             finally:
                 await lake.close()
@@ -88,16 +98,30 @@ def _may_go(row: EpisodeRow, end_ns: float) -> bool:
     return ended and row.refused is None and row.parked is None and row.folded == row.head
 
 
-async def _archive(log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], reason: str, summary: ArchiveSummary) -> None:
+async def _add_and_compare(
+    log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], summary: ArchiveSummary
+) -> dict[str, str]:
+    """Add the events that the lake lacks and read all back; return the digests by id of the episodes that may go."""
     added = await _add_missing(log, lake, rows, summary)
-    read = lake.digests([each.id for each in added])
+    read = await asyncio.to_thread(lake.digests, [each.id for each in added])
     for each in added:
         if read.get(each.id) != each.digest:
             summary.stayed[each.id] = "the lake holds other events of it than this memory"
-    moved = [each for each in rows if each.id not in summary.stayed]
-    digests = {row.number: read[row.id] for row in moved}
-    for some in parts(moved, EVENTS_AT_ONCE):
-        summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=digests))
+    return {name: digest for name, digest in read.items() if name not in summary.stayed}
+
+
+async def _remove(
+    log: EventLog,
+    lake: Lake,
+    rows: Sequence[EpisodeRow],
+    digests: Mapping[str, str],
+    reason: str,
+    summary: ArchiveSummary,
+) -> None:
+    """Remove those of these episodes that have one of these digests in the lake."""
+    numbered = {row.number: digests[row.id] for row in rows if row.id in digests}
+    for some in parts([each for each in rows if each.number in numbered], EVENTS_AT_ONCE):
+        summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=numbered))
 
 
 async def _add_missing(
@@ -171,6 +195,6 @@ async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, 
             blobs[name] = references[name].media_type, content
 
     async def add() -> None:
-        lake.add(episodes, declarations, blobs, log.log_id)
+        await asyncio.to_thread(lake.add, episodes, declarations, blobs, log.log_id)
 
     await retry(add, backoff=_COMMITTING)

@@ -1,5 +1,8 @@
 """`pycrorm copy`: append the episodes of one memory to another memory of any kind, and fold them there.
 
+The command forks two fold workers, which fold what is appended while this process reads and appends the next episodes.
+A caller without them folds in its own process.
+
 An event's key is part of the event, so a copy may be interrupted and repeated, in any order: events that the target has
 are compared, and those after them are appended, with the blobs that they refer to. An episode that is being recorded is
 copied up to its present head; repeating the copy appends the rest. Nothing is written to the source. Episode numbers
@@ -8,11 +11,13 @@ and row ids belong to a database, so the target assigns its own.
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import chain, repeat
 from operator import attrgetter
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeAlias
@@ -34,6 +39,7 @@ from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
 from pycrorm_async.events.types import EVENT_TYPES, EpisodeTagged
 from pycrorm_async.operations.destination import LogAndTables
+from pycrorm_async.operations.workers import Assignment, ChildProcess, FoldWorkers, FoldWorkerTables
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
@@ -42,12 +48,14 @@ from pycrorm_async.store.lake import PREFIX, Lake
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
-from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry
+from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, TablesPort, retry
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
     from pycrorm_async.query.reading import Reading
 
+
+_log = logging.getLogger("pycrorm_async")
 
 Source: TypeAlias = EventLog | Lake
 """What a copy reads: a memory, or a lake, of which archived episodes are restored."""
@@ -91,12 +99,14 @@ async def copy_episodes(
     episodes: Sequence[str] = (),
     settings: Settings | None = None,
     report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
+    forked: Sequence[ChildProcess] = (),
 ) -> CopySummary:
     """Copy episodes, given by number in the source, id, first digits of the id or `last`; by default all of them.
 
-    Creates a missing target. Calls `report_progress` with the number of events done and their total. Damage to one
-    episode does not prevent copying the others. Raises `UnknownEpisode`, `CallerError` if both are the same memory, and
-    the errors of `Memory.open`; events copied until then stay.
+    Creates a missing target. Calls `report_progress` with the number of events done and their total. The processes that
+    the caller has `forked` fold; without any, this one does. Damage to one episode does not prevent copying the others.
+    Raises `UnknownEpisode`, `CallerError` if both are the same memory, and the errors of `Memory.open`; events copied
+    until then stay.
     """
     target_address = shared_address(target)
     log: Source
@@ -111,9 +121,15 @@ async def copy_episodes(
         ]
         chosen = {row.id: row for row in named}
         rows = list(chosen.values()) if episodes else await log.episodes()
+        settings = settings or Settings()
         async with _open_target(target_address, log) as (target_log, destination):
-            copier = _Copier(log, target_log, destination, settings or Settings(), report_progress)
-            done = await copier.copy(rows)
+            assignment = Assignment(target_address, target_log.log_id)
+            async with FoldWorkers(
+                len(forked), assignment, settings=settings, report=_log.warning, note=lambda _: None, forked=forked
+            ) as workers:
+                tables = FoldWorkerTables(destination, workers) if forked else destination
+                copier = _Copier(log, target_log, destination, tables, settings, report_progress)
+                done = await copier.copy(rows)
     finally:
         await log.close()
     return CopySummary(str(log.address), target_address.to_type, done)
@@ -177,19 +193,23 @@ async def _open_target(address: DatabaseAddress, source: Source) -> AsyncIterato
 
 
 class _Copier:
-    """Copies one episode after the other; appends and folds whenever a batch is full."""
+    """Copies one episode after the other: appends whenever a batch is full, and folds meanwhile."""
 
     def __init__(
         self,
         source: Source,
         target: EventLog,
         destination: LogAndTables,
+        tables: TablesPort,
         settings: Settings,
         report_progress: ProgressCallback,
     ) -> None:
         self._source = source
         self._target = target
         self._destination = destination
+        self._tables = tables
+        self._appended = asyncio.Event()
+        self._is_last = False
         self._settings = settings
         self._report_progress = report_progress
         self._done = self._of = 0
@@ -206,15 +226,24 @@ class _Copier:
         removed = await self._target.removed([row.identity for row in rows if is_episode_id(row.id)])
         restores = self._target.blobs.restores
         self._refused |= {each.id: str(each) for each in removed.values() if each.archived_in is None or not restores}
-        for row in rows:
-            if row.id in self._refused:
-                continue
-            try:
-                await self._copy(row, before.get(row.id, 0))
-            except DamageError as damage:
-                self._damage[row.id] = str(damage)
-        await self._append()
-        await self._fold({row.id for row in rows})
+        folding = asyncio.create_task(self._fold({row.id for row in rows}), name="pycrorm copy fold")
+        try:
+            for row in rows:
+                if row.id in self._refused:
+                    continue
+                try:
+                    await self._copy(row, before.get(row.id, 0))
+                except DamageError as damage:
+                    self._damage[row.id] = str(damage)
+                if folding.done():  # it failed
+                    break
+            else:
+                self._is_last = True
+                await self._append()
+            await folding
+        finally:
+            folding.cancel()
+            await asyncio.gather(folding, return_exceptions=True)
         await retry(self._destination.fold, backoff=BRIEF)  # the cases, too
         after = await self._heads(rows)
         if isinstance(self._source, Lake):
@@ -244,15 +273,16 @@ class _Copier:
             await self._compare(row._replace(head=shared))
         if shared == row.head:
             return
-        is_intact = isinstance(self._source, Lake) and self._source.is_intact(row)
+        is_intact = isinstance(self._source, Lake) and await self._source.is_intact(row)
         async for page in self._source.pages(row, after=shared):
             events = self._batch.setdefault(row.identity, [])
-            for event in page:
-                if not is_intact:
-                    _refuse_unreadable(row.id, event)
+            for event in page if not is_intact else ():
+                _refuse_unreadable(row.id, event)
                 events.append(event)
-                self._batch_bytes += len(event.payload)
+            if is_intact:
+                events += page
             self._batch_events += len(page)
+            self._batch_bytes += sum(len(each.payload) for each in page)
             self._progress(len(page))
             settings = self._settings
             if self._batch_events >= settings.batch_events_max or self._batch_bytes >= BATCH_BYTES_MAX:
@@ -295,9 +325,7 @@ class _Copier:
     async def _append(self) -> None:
         batch, self._batch, self._batch_events, self._batch_bytes = self._batch, {}, 0, 0
         declarations = await self._declarations(batch.values())
-        records = {
-            episode: [make(Record, (0, episode, *each[1:])) for each in events] for episode, events in batch.items()
-        }
+        records = {episode: _records(episode, events) for episode, events in batch.items()}
         try:
             await self._append_at_once([*declarations, *chain.from_iterable(records.values())])
         except DamageError:
@@ -307,12 +335,20 @@ class _Copier:
                     await self._append_at_once([*declarations, *events])
                 except DamageError as damage:
                     self._damage[episode_text(episode)] = str(damage)
-        await self._fold({episode_text(episode) for episode in batch})
+        self._appended.set()
 
     async def _fold(self, episodes: set[str]) -> None:
-        """Fold until these episodes are visible; others may stay behind while other processes append to them."""
-        while episodes & (await self._destination.behind()).keys():
-            await retry(self._destination.fold_next_batch, backoff=BRIEF)
+        """Fold beside `_append`, until it has come to its end and these episodes are visible.
+
+        Others may stay behind while other processes append to them.
+        """
+        is_last = False
+        while not is_last:
+            await self._appended.wait()
+            self._appended.clear()
+            is_last = self._is_last
+            while episodes & (await self._tables.behind()).keys():
+                await retry(self._tables.fold_next_batch, backoff=BRIEF)
 
     async def _append_at_once(self, records: Sequence[Record]) -> None:
         refusals = await retry(partial(self._destination.append, records), backoff=BRIEF)
@@ -329,6 +365,11 @@ class _Copier:
         sent = {name: payload for name, payload in self._declared.items() if name in missing} | descriptions
         self._sent |= sent.keys()
         return [Record(0, None, 0, declaration_type(name), 1, 0, 0, payload) for name, payload in sent.items()]
+
+
+def _records(episode: EpisodeId, events: Sequence[StoredEvent]) -> list[Record]:
+    _, *columns = zip(*events, strict=True)
+    return [*map(make, repeat(Record), zip(repeat(0), repeat(episode), *columns, strict=False))]
 
 
 def _refuse_unreadable(episode: str, event: StoredEvent) -> None:

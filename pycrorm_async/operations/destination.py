@@ -100,10 +100,10 @@ class LogAndTables:
     # --- the log ----------------------------------------------------------------------------------------------
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        if self._spool is None:
+            return await self.log.append(records)
         await self.log.store_blobs(records)  # before this process' turn, so that others need not wait for large blobs
         async with self._appending:
-            if self._spool is None:
-                return await self.log.append(records)
             for _ in range(_HEALINGS_MAX):
                 if self._heads is None:
                     await self.confirm()

@@ -420,21 +420,20 @@ class Appending:
         restored: dict[EpisodeId, int] = {}
         for each, removed in (await removed_of(self._dialect, connection, missing)).items() if missing else ():
             missing.remove(each)
-            if removed.archived_in is None or self._batch.episodes[each][-1].sequence <= removed.head:
+            if self._restoring and removed.archived_in is not None:
+                restored[each] = removed.number
+            elif removed.archived_in is None or self._batch.episodes[each][-1].sequence <= removed.head:
                 self.discarded[each] = removed
             else:
                 refusals[each] = str(removed)
-            if self._restoring and removed.archived_in is not None:
-                self.discarded.pop(each, None)
-                refusals.pop(each, None)
-                restored[each] = removed.number
-                now_ns = SYSTEM_CLOCK.wall_ns()
-                await self._dialect.execute(connection, schema.UPDATE_RESTORED, restored=removed.id, now_ns=now_ns)
-        numbers = restored | (await self._assign_numbers(connection, missing) if missing else {})
+        if restored:
+            now_ns, numbers = SYSTEM_CLOCK.wall_ns(), [(number,) for number in restored.values()]
+            await self._dialect.execute(connection, schema.UPDATE_RESTORED, now_ns=now_ns, numbers=numbers)
+        assigned = restored | (await self._assign_numbers(connection, missing) if missing else {})
         most = EPISODE_NUMBER_MAX
-        if max(numbers.values(), default=0) > EPISODE_NUMBER_MAX_0_1:
+        if max(assigned.values(), default=0) > EPISODE_NUMBER_MAX_0_1:
             most = await self._dialect.number_max(connection)
-        for each, number in numbers.items():
+        for each, number in assigned.items():
             if number > most:
                 refusals[each] = f"all {most:,} episode numbers of this memory are used: {_room(most, _MOVE)}"
             else:

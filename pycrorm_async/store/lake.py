@@ -11,9 +11,11 @@ too, so those of payloads are cleared: otherwise they would outlive an erased ep
 
 # ruff: noqa: S608 - the SQL is composed of names and of paths that the caller gave
 
+import asyncio
 import logging
 import math
 import sqlite3
+import threading
 import time
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import closing, suppress
@@ -250,7 +252,7 @@ def _one_of(names: Collection[str], column: str) -> str:
 
 
 class Lake:
-    """An open lake, also as the source of a copy. Each call blocks while DuckDB works."""
+    """An open lake, also as the source of a copy. Calls block while DuckDB works; a thread may make them."""
 
     def __init__(self, address: str, *, write: bool = False) -> None:
         self.address = shown(address)
@@ -258,18 +260,21 @@ class Lake:
         self._given = address
         self.blobs = self
         self._connection = open_lake(address, write=write)
+        self._turn = threading.RLock()  # a task that is cancelled does not wait for its thread, and closes the lake
         self._listed: list[LakeEpisode] = []
         self._places: dict[str, int] = {}
         self._events: dict[str, list[StoredEvent]] = {}
 
     async def close(self) -> None:
-        """Close the connection."""
-        self._connection.close()
+        """Close the connection, when no thread uses it."""
+        with self._turn:
+            self._connection.close()
 
     def execute(self, sql: str) -> list[tuple[Any, ...]]:
         """Return the rows of a statement. Raises `DatabaseUnavailable`."""
         try:
-            rows: list[tuple[Any, ...]] = self._connection.execute(sql).fetchall()
+            with self._turn:
+                rows: list[tuple[Any, ...]] = self._connection.execute(sql).fetchall()
         except import_module("duckdb").Error as error:
             raise unavailable(self._given, error) from error
         return rows
@@ -277,7 +282,8 @@ class Lake:
     def _table(self, sql: str) -> Any:
         """Return the rows of a query as a table of Arrow, at a quarter of the cost of tuples."""
         try:
-            return self._connection.execute(sql).to_arrow_table().combine_chunks()
+            with self._turn:
+                return self._connection.execute(sql).to_arrow_table().combine_chunks()
         except import_module("duckdb").Error as error:
             raise unavailable(self._given, error) from error
 
@@ -322,26 +328,27 @@ class Lake:
 
         Raises `LogDamaged` at the first missing event.
         """
-        events = consecutive(self._read(episode)[: episode.head], 0)
+        events = consecutive((await self._read(episode))[: episode.head], 0)
         del self._events[episode.id]
         for first in range(after, len(events), _PAGE_EVENTS):
             yield events[first : first + _PAGE_EVENTS]
         if len(events) < episode.head:
             raise LogDamaged(episode.id, len(events) + 1, f"is missing in {self.address}")
 
-    def is_intact(self, episode: EpisodeRow) -> bool:
+    async def is_intact(self, episode: EpisodeRow) -> bool:
         """Return whether the events of an episode have the digest that they had in the memory that archived them."""
-        digest = digest_after(RunningDigest.at_start(episode.identity), self._read(episode))
+        digest = digest_after(RunningDigest.at_start(episode.identity), await self._read(episode))
         return digest == self._listed[self._places[episode.id]].digest
 
-    def _read(self, episode: EpisodeRow) -> list[StoredEvent]:
+    async def _read(self, episode: EpisodeRow) -> list[StoredEvent]:
         """Read an episode with those that were listed behind it, because a query costs more than an episode."""
         if episode.id not in self._events:
             first = place = self._places[episode.id]
             left = _EVENTS_AT_ONCE - self._listed[first].head
             while (place := place + 1) < len(self._listed) and self._listed[place].head <= left:
                 left -= self._listed[place].head
-            self._events = self._events_of([each.id for each in self._listed[first:place]])
+            ids = [each.id for each in self._listed[first:place]]
+            self._events = await asyncio.to_thread(self._events_of, ids)
         return self._events[episode.id]
 
     def _events_of(self, ids: Sequence[str]) -> dict[str, list[StoredEvent]]:
@@ -434,11 +441,12 @@ class Lake:
 
     def _insert_columns(self, table: str, columns: Sequence[Any], selected: str) -> None:
         named = {f"c{place}": column for place, column in enumerate(columns)}
-        self._connection.register("new_rows", import_module("pyarrow").table(named))
-        try:
-            self.execute(f"INSERT INTO {table} SELECT {selected} FROM new_rows")
-        finally:
-            self._connection.unregister("new_rows")
+        with self._turn:
+            self._connection.register("new_rows", import_module("pyarrow").table(named))
+            try:
+                self.execute(f"INSERT INTO {table} SELECT {selected} FROM new_rows")
+            finally:
+                self._connection.unregister("new_rows")
 
     def erased(self, ids: Collection[str]) -> dict[str, str]:
         """Return when and why those of these episodes were erased that the lake takes from no memory, by id."""
@@ -484,6 +492,8 @@ class Lake:
 
     def absent(self, table: str, key: str, names: Collection[str]) -> set[str]:
         """Return those of these keys that a table of the lake lacks."""
+        if not names:
+            return set()
         query = f"SELECT DISTINCT {key} FROM {table} WHERE {_one_of(names, key)}"
         return {*names} - {name for (name,) in self.execute(query)}
 

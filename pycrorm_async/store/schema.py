@@ -395,7 +395,7 @@ UPDATE_FINISHED: Final = (
 )
 UPDATE_RESTORED: Final = (
     sql.update(REMOVED)
-    .where(REMOVED.c.id == bindparam("restored"))
+    .where(_is_among(REMOVED.c.number, "numbers"))
     .values(restored_wall_ns=bindparam("now_ns", type_=_Long))
 )
 

@@ -370,8 +370,8 @@ async def test_an_episode_that_is_erased_from_the_lake_during_its_restore_is_nam
     await archived(url, lake)
     read, done = Lake.is_intact, list[bool]()
 
-    def erased_then(self: Lake, episode: EpisodeRow) -> bool:
-        done.append(read(self, episode))  # reads both
+    async def erased_then(self: Lake, episode: EpisodeRow) -> bool:
+        done.append(await read(self, episode))  # reads both
         if len(done) == 1:
             process = ForkedProcess(erase_until, lake, ids[0], 0)
             assert process.wait() == 0, process.lines

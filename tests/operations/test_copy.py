@@ -20,6 +20,7 @@ from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.operations.workers import WORKERS, forked
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Backoff
 from tests.crash.forked_processes import ForkedProcess
@@ -208,7 +209,11 @@ async def test_a_running_episode_is_copied_as_far_as_it_is_and_later_completed(n
 
 
 def copy_and_print(source: str, target: str) -> None:
-    asyncio.run(copy_episodes(source, target, settings=SMALL, report_progress=lambda done, *_: print(done)))
+    with forked(WORKERS, target) as workers:  # as the command does
+        copying = copy_episodes(
+            source, target, settings=SMALL, report_progress=lambda done, *_: print(done), forked=workers
+        )
+        asyncio.run(copying)
 
 
 @pytest.mark.soak_on("postgresql")
