@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from itertools import chain
 from pathlib import Path
+from struct import Struct
 from types import BuiltinMethodType, MethodWrapperType, ModuleType, NoneType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -91,6 +92,18 @@ def _event_values(records: Sequence[Sequence[Any]], number: int) -> tuple[Any, .
     return tuple([value for each in records for value in (number, *each[2:-1], each[-1].decode())])
 
 
+def _copy_rows(records: Sequence[Sequence[Any]], number: int, sizes: Sequence[int]) -> bytes:
+    kinds = ["iq"[each == 8] for each in sizes]
+    start, end = Struct(">hi{}i{}i".format(*kinds)), Struct(">i{}i{}i{}i".format(*kinds[3:]))
+    rows: list[bytes] = []
+    for _, _, sequence, kind, version, wall_ns, monotonic_ns, payload in records:
+        name = kind.encode()
+        rows += (start.pack(len(sizes), sizes[0], number, sizes[1], sequence, len(name)), name)
+        times = (sizes[4], wall_ns, sizes[5], monotonic_ns)
+        rows += (end.pack(sizes[3], version, *times, len(payload)), payload)
+    return b"".join(rows)
+
+
 def _row_values(rows: list[Any], null: Any) -> tuple[Any, ...]:
     # Three rows show whether others are worth a search; a value that is not found is bound as it is.
     kinds = {type(each) for row in (rows[0], rows[len(rows) // 2], rows[-1]) for each in row} if rows else set()
@@ -116,6 +129,10 @@ and for a scan, else None: the open episodes, which the call updates, and a list
 event_values: Final[Callable[[list[Any], int], tuple[Any, ...]]] = getattr(_compiled, "event_values", _event_values)
 """Return the values of the rows of these records, one row after the other: the number, then those from the sequence on,
 with the payload as text."""
+
+copy_rows: Final[Callable[[list[Any], int, Sequence[int]], bytes]] = getattr(_compiled, "copy_rows", _copy_rows)
+"""Return the rows of these records in PostgreSQL's binary format of COPY: the columns of `event_values`, which have
+these sizes in bytes; -1 is that of a text."""
 
 row_values: Final[Callable[[list[Any], Any], tuple[Any, ...]]] = getattr(_compiled, "row_values", _row_values)
 """Return the values of rows of equal length, one row after the other, with `null` for None and 0 and 1 for booleans.

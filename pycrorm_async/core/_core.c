@@ -455,6 +455,59 @@ failed:
     return NULL;
 }
 
+static uint8_t *put(uint8_t *at, uint64_t value, Py_ssize_t size) { /* big endian */
+    for (Py_ssize_t n = size; n--; value >>= 8) at[n] = (uint8_t)value;
+    return at + size;
+}
+
+/* copy_rows(records, number, sizes) -> the events' rows in PostgreSQL's binary format of COPY; the columns have these
+ * sizes in bytes, and -1 is that of a text */
+static PyObject *copy_rows(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    enum { COLUMNS = 7, TYPE = 2 };
+    PyObject *records, *rows = NULL;
+    long long number;
+    int sizes[COLUMNS];
+    if (!PyArg_ParseTuple(arguments, "O!L(iiiiiii)", &PyList_Type, &records, &number, sizes, sizes + 1, sizes + 2,
+                          sizes + 3, sizes + 4, sizes + 5, sizes + 6))
+        return NULL;
+    for (int writes = 0; writes < 2; writes++) { /* the first round adds up the sizes */
+        uint8_t *at = writes ? (uint8_t *)PyBytes_AsString(rows) : NULL;
+        Py_ssize_t count = PyList_Size(records), total = 0;
+        for (Py_ssize_t row = 0; row < count; row++) {
+            PyObject *record = PyList_GetItem(records, row);
+            if (writes) at = put(at, COLUMNS, 2);
+            total += 2;
+            for (int n = 0; n < COLUMNS; n++) {
+                PyObject *item = n ? PyTuple_GetItem(record, n + 1) : NULL;
+                Py_ssize_t size = sizes[n];
+                long long value = number;
+                char *text = NULL;
+                if (n && !item) goto failed;
+                if (size > 0)
+                    value = n ? PyLong_AsLongLong(item) : number;
+                else if (n == TYPE)
+                    text = (char *)PyUnicode_AsUTF8AndSize(item, &size);
+                else
+                    PyBytes_AsStringAndSize(item, &text, &size);
+                if (size == 4 && !text && value != (int32_t)value)
+                    PyErr_SetString(PyExc_OverflowError, "a value of a record does not fit its column");
+                if (PyErr_Occurred()) goto failed;
+                total += 4 + size;
+                if (!writes) continue;
+                at = put(at, (uint64_t)size, 4);
+                if (text) memcpy(at, text, (size_t)size), at += size;
+                else at = put(at, (uint64_t)value, size);
+            }
+        }
+        if (!writes && !(rows = PyBytes_FromStringAndSize(NULL, total))) return NULL;
+    }
+    return rows;
+
+failed:
+    Py_XDECREF(rows);
+    return NULL;
+}
+
 /* row_values(rows, null) -> the values of the rows, one row after the other, with `null` for None and 0 and 1 for
  * booleans */
 static PyObject *row_values(PyObject *Py_UNUSED(module), PyObject *arguments) {
@@ -500,6 +553,7 @@ static PyObject *py_crc32(PyObject *Py_UNUSED(module), PyObject *arguments) { /*
 static PyMethodDef methods[] = {
     {"take_records", take_records, METH_VARARGS, NULL},
     {"event_values", event_values, METH_VARARGS, NULL},
+    {"copy_rows", copy_rows, METH_VARARGS, NULL},
     {"row_values", row_values, METH_VARARGS, NULL},
     {"crc32", py_crc32, METH_VARARGS, NULL},
     {0}};

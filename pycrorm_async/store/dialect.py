@@ -381,14 +381,9 @@ class Dialect(ABC):
         The rows are read now, or once while they are inserted.
         """
 
+    @abstractmethod
     async def event_insertion(self, parts: Iterable[tuple[int, list[Record]]]) -> Insertion:
         """Prepare the insertion of events as `insertion` does; each part has records and their episode's number."""
-        rows = (
-            (number, sequence, type_name, version, wall_ns, monotonic_ns, payload.decode())
-            for number, records in parts
-            for _, _, sequence, type_name, version, wall_ns, monotonic_ns, payload in records
-        )
-        return await self.insertion({(schema.EVENT.name, schema.EVENT_COLUMNS): rows})
 
     @abstractmethod
     async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:

@@ -43,9 +43,10 @@ from sqlalchemy.dialects.postgresql.asyncpg import PGDialect_asyncpg
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async import errors
+from pycrorm_async import core, errors
 from pycrorm_async.bulk_records import make
 from pycrorm_async.events import ids
+from pycrorm_async.events.codec import Record
 from pycrorm_async.store import dialect, postgresql_errors, schema
 from pycrorm_async.store.placement import PLAIN, SHARD_SCHEMA, Placement, Shard
 from pycrorm_async.store.postgresql_engine import LOCK_TIMEOUT, PATH, STRANGER, WARNING
@@ -210,6 +211,14 @@ WHERE sync_state IN ('sync', 'quorum') ORDER BY application_name"""
 WRITE_AHEAD = "SELECT pg_catalog.pg_logical_emit_message(true, 'pycrorm', '')"
 """Writes an empty message to the server's write-ahead log. A COMMIT without any record there waits for no standby, and
 could acknowledge events of another transaction that no standby has yet."""
+
+EVENT_SIZES = "pycrorm_event_sizes"
+"""Key in a connection's `info` for the sizes of the columns of the events."""
+SELECT_EVENT_SIZES = f"""
+SELECT attlen FROM pg_catalog.pg_attribute
+WHERE attrelid = '{LOG}.event'::regclass AND attnum > 0 AND NOT attisdropped ORDER BY attnum"""
+"""Selects the size of each column in bytes, which the binary format needs; -1 for a text. Logs of earlier versions have
+columns of another size."""
 
 # LATERAL, so that each span is read by the primary key, whatever the size of the table.
 SELECT_SPANS = f"""
@@ -517,13 +526,23 @@ class PostgreSQL(dialect.Dialect):
     async def insertion(self, rows: dialect.RowsByTable) -> dialect.Insertion:
         return rows  # the driver encodes a row while the server stores the previous ones
 
+    async def event_insertion(self, parts: Iterable[tuple[int, list[Record]]]) -> dialect.Insertion:
+        return {(schema.EVENT.name, schema.EVENT_COLUMNS): parts}
+
     async def insert(self, connection: AsyncConnection, insertion: dialect.Insertion) -> None:
         # In the transaction that an earlier statement through SQLAlchemy began.
-        driver = await _driver(connection)
+        raw = await connection.get_raw_connection()
+        driver: Any = raw.driver_connection
         for (table, columns), some in insertion.items():
-            place = LOG if table == schema.EVENT.name else TABLES
+            if table != schema.EVENT.name:
+                with postgresql_errors.rows_refused():
+                    await driver.copy_records_to_table(table, schema_name=TABLES, columns=columns, records=some)
+                continue
+            if EVENT_SIZES not in raw.info:
+                raw.info[EVENT_SIZES] = tuple((await connection.exec_driver_sql(SELECT_EVENT_SIZES)).scalars())
+            rows = _binary(some, raw.info[EVENT_SIZES])
             with postgresql_errors.rows_refused():
-                await driver.copy_records_to_table(table, schema_name=place, columns=columns, records=some)
+                await driver.copy_to_table(table, schema_name=LOG, columns=columns, source=rows, format="binary")
 
     async def update_rows(
         self,
@@ -565,6 +584,14 @@ async def _driver(connection: AsyncConnection) -> Any:
     driver = (await connection.get_raw_connection()).driver_connection
     assert driver is not None
     return driver
+
+
+async def _binary(parts: Iterable[tuple[int, list[Record]]], sizes: Sequence[int]) -> AsyncIterator[bytes]:
+    """Yield events in the binary format of COPY, one part at a time: the server stores it while the next is made."""
+    yield b"PGCOPY\n\xff\r\n\0" + bytes(8)
+    for number, records in parts:
+        yield core.copy_rows(records, number, sizes)
+    yield b"\xff\xff"
 
 
 def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], ...]:

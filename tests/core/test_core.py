@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import random
+import struct
 import subprocess
 import sys
 import threading
@@ -443,6 +444,41 @@ def test_values_of_records_that_no_database_holds_are_refused_by_both_cores() ->
     for wrong in (damaged[:7], "text", damaged._replace(payload="text")):  # type: ignore[arg-type]
         with pytest.raises((TypeError, IndexError, SystemError)):
             core.event_values([wrong], 1)
+
+
+SIZES = (4, 4, -1, 4, 8, 8, -1)
+
+
+@compiled
+@given(
+    st.lists(
+        st.builds(
+            lambda kind, text, version, wall: factories.record(1, node(), 1, text.encode())._replace(
+                type=kind, version=version, wall_ns=wall, monotonic_ns=-wall
+            ),
+            st.text(),
+            st.text(),
+            st.integers(0, 2**16 - 1),
+            st.integers(1 - 2**63, 2**63 - 1),
+        )
+    ),
+    st.sampled_from([SIZES, (8, 8, -1, 8, 8, 8, -1)]),
+)
+def test_both_cores_make_the_same_rows_for_a_server(records: list[Record], sizes: tuple[int, ...]) -> None:
+    assert core.copy_rows(records, 4_194_303, sizes) == core._copy_rows(records, 4_194_303, sizes)
+
+
+@compiled
+def test_records_that_no_server_holds_are_refused_by_both_cores() -> None:
+    sound = factories.record(1, node(), 1, b"{}")
+    large = sound._replace(version=2**31), sound._replace(sequence=-(2**31) - 1), sound._replace(wall_ns=2**63)
+    wrong = sound[:7], "text", sound._replace(payload="text"), sound._replace(type=b"type")  # type: ignore[arg-type]
+    for make in (core.copy_rows, core._copy_rows):
+        for each in (*large, *wrong):
+            with pytest.raises(
+                (OverflowError, struct.error, TypeError, IndexError, SystemError, ValueError, AttributeError)
+            ):
+                make([sound, each], 1, SIZES)
 
 
 def exact(values: tuple[Any, ...], null: float) -> list[tuple[type, Any]]:

@@ -10,14 +10,16 @@ from typing import Any
 import pytest
 from sqlalchemy import BigInteger, Boolean, Column, Double, Integer, MetaData, Table, Text, select
 
+from pycrorm_async import core
 from pycrorm_async.errors import DamageError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_text
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
-from tests.databases import ask, ask_to_change
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.store.factories import HEADS, declaration, episode, name, record, run_of
 
 # === append ===================================================================================================
@@ -38,6 +40,7 @@ async def test_every_column_is_stored_as_it_was_appended(log: EventLog, database
     assert [tuple(each) for each in await log.events(1, after=1)] == [(1, *each[2:]) for each in records[1:]]
 
 
+_LARGER = "ALTER COLUMN {} TYPE bigint"
 PAYLOADS = [
     '{"x":0.1,"y":1e-310,"z":-0.0,"w":123456789012345678,"v":1.0}',
     '{ "b" : 1,\n\t"a":2 , "b":3 }',
@@ -56,6 +59,25 @@ async def test_a_payload_is_stored_byte_for_byte(log: EventLog, database_url: st
     )
     assert [row[0] for row in ask(database_url, "SELECT payload FROM event ORDER BY sequence")] == PAYLOADS
     assert [each.payload for each in await log.events(1)] == [text.encode() for text in PAYLOADS]
+
+
+async def test_events_are_stored_alike_in_the_larger_columns_of_an_earlier_version(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = []
+    for kinds in ((), ("episode", "sequence", "version")):
+        for copy_rows in (core.copy_rows, core._copy_rows):
+            url = server.new_memory()
+            if kinds:
+                larger = f"ALTER TABLE pycrorm.event {', '.join(map(_LARGER.format, kinds))}"
+                change_each(url, ["DROP SCHEMA memory CASCADE", larger])
+            monkeypatch.setattr(core, "copy_rows", copy_rows)
+            async with await EventLog.open(DatabaseAddress.parse(url), create=True) as log:
+                await log.append([record(episode(1), at, payload=text.encode()) for at, text in enumerate(PAYLOADS, 1)])
+                await log.append(run_of(episode(1), len(PAYLOADS) + 1, 3_000))
+            rows.append(ask(url, "SELECT * FROM event ORDER BY sequence"))
+    assert len(rows[0]) == 3_000
+    assert rows[1:] == [rows[0]] * 3
 
 
 async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: EventLog, database_url: str) -> None:
