@@ -20,7 +20,7 @@ import asyncio
 import logging
 import socket
 import time
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -99,9 +99,11 @@ class LogAndTables:
 
     # --- the log ----------------------------------------------------------------------------------------------
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
         if self._spool is None:
-            return await self.log.append(records)
+            return await self.log.append(records, on_wait)
         await self.log.store_blobs(records)  # before this process' turn, so that others need not wait for large blobs
         async with self._appending:
             for _ in range(_HEALINGS_MAX):
@@ -109,7 +111,7 @@ class LogAndTables:
                     await self.confirm()
                 heads = self._heads or {}
                 try:
-                    stored = await self.log.store(records, witness=next(reversed(heads.items()), None))
+                    stored = await self.log.store(records, on_wait=on_wait, witness=next(reversed(heads.items()), None))
                 except errors.LogWentBack:
                     await self.confirm()
                     continue
@@ -117,7 +119,7 @@ class LogAndTables:
                     break
                 await self.confirm()
             else:
-                stored = await self.log.store(records)
+                stored = await self.log.store(records, on_wait=on_wait)
         self._numbers.note({each: row.number for each, row in stored.rows.items()})
         others = {each: head for each, head in (self._heads or {}).items() if each not in stored.rows}
         self._heads = _latest(others | {each: row.head for each, row in stored.rows.items()})

@@ -411,8 +411,9 @@ def span_checksum(checksums: Sequence[int]) -> int:
 # uses `scan.py`.
 
 
-RECORDS_AT_ONCE: Final = 1_000
-"""Bounds the records taken by one call of the compiled core, which holds the interpreter lock: half a millisecond."""
+RECORDS_AT_ONCE: Final = 500
+"""Bounds the records read between two steps of other tasks, and by one call of the compiled core, which holds the
+interpreter lock: half a millisecond."""
 
 
 class ReadCursor(NamedTuple):

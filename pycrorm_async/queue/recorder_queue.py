@@ -43,7 +43,7 @@ from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.blobs import LiveBlobs
 from pycrorm_async.queue.format import ReadBatch, ReadCursor, Reader, ReadPlace, Segment, header_bytes
 from pycrorm_async.queue.locks import ALIVE, DRAIN, FileIdentity, FileLock, call_in_forked_child, is_locked
-from pycrorm_async.queue.sources import DeadLetters
+from pycrorm_async.queue.sources import DeadLetters, read_in_parts
 from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.queue.sync_thread import Notifier, SyncThread
 from pycrorm_async.settings import Settings
@@ -581,7 +581,9 @@ class OwnSource:
     async def _batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
         self._take_drain()
         await self._notifier.until(partial(self._has_news, self.reader.cursor.position))
-        batch = self._read(None, events_max, bytes_max)
+        last = self._queue.synced
+        with spools.wrap_os_errors(self._queue.folder):
+            batch = await read_in_parts(self.reader, last, events_max=events_max, bytes_max=bytes_max)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(age_s_max):
                 while not batch.complete and not self._queue.ends_at(batch.after.position):
@@ -595,7 +597,7 @@ class OwnSource:
     def _has_news(self, position: int) -> bool:
         return self._queue.synced > position or self._queue.ends_at(position)
 
-    def _read(self, partial_batch: ReadBatch | None, events_max: int, bytes_max: int) -> ReadBatch:
+    def _read(self, partial_batch: ReadBatch, events_max: int, bytes_max: int) -> ReadBatch:
         with spools.wrap_os_errors(self._queue.folder):
             last = self._queue.synced
             return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=partial_batch)

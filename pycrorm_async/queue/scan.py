@@ -19,7 +19,8 @@ Scanning changes no file. `seal` truncates the files at the cut and first copies
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -138,14 +139,19 @@ class SegmentScanner:
 
         Raises what `scan` raises.
         """
+        deque(self.parts(), 0)
+        return not self.finished
+
+    def parts(self) -> Iterator[None]:
+        """Do a step in parts, so that other tasks of a loop can run in between."""
         if self.damage is not None:
             raise self.damage
         if self.finished:
-            return False
+            return
         try:
-            if self._steps < len(self._numbers) and self._scan_segment(self._numbers[self._steps]):
+            if self._steps < len(self._numbers) and (yield from self._scan_segment(self._numbers[self._steps])):
                 self._steps += 1
-                return True
+                return
             if self._paths is None:
                 _refuse_damage(self._folder, self._recorder, self.prefix)
         except SpoolDamaged as damage:
@@ -158,13 +164,17 @@ class SegmentScanner:
             self.damage = SpoolDamaged(path, self._cut.offset, f"{type(error).__name__}: {error}")
             raise self.damage from error
         self.finished = True
-        return False
 
     @property
     def prefix(self) -> ValidPrefix:
         """The records scanned so far."""
         opened = {EpisodeId(episode): spool_format.LastRecord(*last) for episode, last in self._open.items()}
         return ValidPrefix(self._start, self._cut, self._bases, opened, self._numbers)
+
+    @property
+    def number(self) -> int:
+        """The number of the segment with the cut."""
+        return self._cut.number
 
     @property
     def confirmed(self) -> int:
@@ -175,8 +185,8 @@ class SegmentScanner:
     def uncommitted(self) -> tuple[int, ...]:
         return tuple(self._uncommitted)
 
-    def _scan_segment(self, number: int) -> bool:
-        """Scan one segment; False if it does not continue the one before."""
+    def _scan_segment(self, number: int) -> Generator[None, None, bool]:
+        """Scan one segment in parts; return False if it does not continue the one before."""
         path = spool_format.segment_path(self._folder, number) if self._paths is None else self._paths[number]
         buffer = spool_format.read_segment(path)
         header = read_header(path, buffer, recorder=self._recorder, number=number)
@@ -193,10 +203,10 @@ class SegmentScanner:
             self._open = dict(header.open.items())
         self._bases[number] = header.base
         self._cut = spool_format.ReadCursor(number, first, header.base - 1)
-        self._scan_records(path, buffer, number)
+        yield from self._scan_records(path, buffer, number)
         return True
 
-    def _scan_records(self, path: Path, buffer: spool_format.Buffer, number: int) -> None:
+    def _scan_records(self, path: Path, buffer: spool_format.Buffer, number: int) -> Iterator[None]:
         """Keep a segment's records from the cut to the first hole or damage, and move the cut there."""
         _, offset, position = self._cut
         salt = spool_format.salt_of(self._recorder, number)
@@ -207,6 +217,8 @@ class SegmentScanner:
                     until = position + spool_format.RECORDS_AT_ONCE
                     offset, position = self._take(buffer, offset, salt, position, until)
                     if position == until:
+                        self._cut = spool_format.ReadCursor(number, offset, position)
+                        yield
                         continue
                 for frame in spool_format.decode_each(buffer, offset, salt):
                     if frame[0] == spool_format.COMMIT:
@@ -224,6 +236,9 @@ class SegmentScanner:
                         )
                     if in_steps:
                         break
+                    if position % spool_format.RECORDS_AT_ONCE == 0:
+                        self._cut = spool_format.ReadCursor(number, offset, position)
+                        yield
                 else:
                     return
         finally:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from itertools import accumulate
 from pathlib import Path
@@ -164,11 +165,12 @@ def _last_of(record: Record | spool_format.Frame) -> spool_format.LastRecord:
 # excludes other drainers; `release` releases both. No process writes the segments any more, so the only races are with
 # other recoverers, which the locks exclude, and with a kill of this process.
 #
-# The source scans one segment at a time (`scan.py`) and syncs it before it supplies any of its records: a killed
-# process' last pages may exist only in the page cache. `get_batch` supplies records up to the scanner's `confirmed`
-# position, that is records covered by a commit frame, and the rest only when the whole folder is scanned. So a folder
-# that is damaged further on supplies its records before the damage and then raises `SpoolDamaged`. A repair of that
-# folder keeps the same records at its beginning, so draining again continues with the same positions and sequences.
+# The source scans as far as a batch needs (`scan.py`), in parts, between which other tasks of the loop run, such as the
+# append of the batch before. It syncs a segment before it supplies any of its records: a killed process' last pages may
+# exist only in the page cache. `get_batch` supplies records up to the scanner's `confirmed` position, that is records
+# covered by a commit frame, and the rest only when the whole folder is scanned. So a folder that is damaged further on
+# supplies its records before the damage and then raises `SpoolDamaged`. A repair of that folder keeps the same records
+# at its beginning, so draining again continues with the same positions and sequences.
 #
 # When the scan has finished, each open episode without a name of its own gets a computed end: an EpisodeEnded of status
 # LOST behind the last record, derived from the episode's last record and never written to the folder. A recovery that
@@ -223,10 +225,14 @@ class DeadSource:
         self._ready: list[Record] = []
         """Records scanned but not supplied yet; those beyond position `_confirmed` must wait."""
         self._confirmed = 0
-        self._is_scanned = False  # set last, because a cancelled task leaves its scan to a thread
+        self._is_scanned = False
         self._scanner = scan.SegmentScanner(folder, recorder, records=self._ready)
-        while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
-            pass
+        self._parts: Iterator[None] | None = None  # of the segment that is being scanned
+        self._supplied = self._synced = 0
+        while not self._is_scanned and self._confirmed == self._scanner.prefix.start.position:
+            deque(self._scan_further(1), 0)
+            self._sync(self._scanner.number)
+            self._confirm(self._scanner.number)
         self._released = False
         self._stored_segments = stored
         self._dead_letters = DeadLetters(folder)
@@ -254,9 +260,13 @@ class DeadSource:
         Raises `SpoolDamaged` when only records that damage may affect remain, and `SpoolUnavailable`.
         """
         batch = self._next(events_max, bytes_max)
-        while not (batch.complete or self._scanner.finished):
+        while not (batch.complete or self._is_scanned):
             try:
-                await asyncio.to_thread(self._scan_further)
+                for _ in self._scan_further(events_max):
+                    await asyncio.sleep(0)
+                number = self._scanner.number
+                await asyncio.to_thread(self._sync, number)
+                self._confirm(number)
             except SpoolDamaged:
                 if not batch.records:
                     raise
@@ -342,20 +352,29 @@ class DeadSource:
             blobs = blob_files(self.folder) if number == numbers[-1] else []
             self._delete_segment(spool_format.segment_path(self.folder, number), length=length, blobs=blobs)
 
-    def _scan_further(self) -> bool:
-        """Scan and sync the next segment; False if there is none."""
+    def _scan_further(self, count: int) -> Iterator[None]:
+        """Scan until this many records are ready, at most to the end of the segment; yield after each part."""
         with spool.wrap_os_errors(self.folder):
-            if self._scanner.finished:
-                return False
-            more = self._scanner.step()
-            if more:
-                scan.sync_segments(self.folder, [self._scanner.prefix.cut.number])
-        if not more:
+            self._parts = self._parts or self._scanner.parts()
+            for _ in self._parts:
+                if self._scanner.confirmed - self._supplied >= count:
+                    return
+                yield
+            self._parts = None
+
+    def _sync(self, number: int) -> None:
+        if number != self._synced:
+            with spool.wrap_os_errors(self.folder):
+                scan.sync_segments(self.folder, [number])
+
+    def _confirm(self, number: int) -> None:
+        """Note that this segment, to which the scan has got, is synced, so that its records may be supplied."""
+        self._synced = number
+        if self._scanner.finished and not self._is_scanned:
             self.lost = computed_ends(self._scanner.prefix)
             self._ready += self.lost
         self._confirmed = self._scanner.confirmed + len(self.lost)
-        self._is_scanned = not more
-        return more
+        self._is_scanned = self._scanner.finished
 
     def _next(self, events_max: int, bytes_max: int) -> _Batch:
         records = self._ready[: min(events_max, self._confirmed - self._supplied)]
@@ -393,6 +412,20 @@ def computed_ends(prefix: scan.ValidPrefix) -> tuple[Record, ...]:
         )
         for index, (episode, last) in enumerate(open_)
     )
+
+
+async def read_in_parts(
+    reader: spool_format.Reader, last: int, *, events_max: int, bytes_max: int
+) -> spool_format.ReadBatch:
+    """Read a batch as `reader.read` does, in parts, between which other tasks of the loop run."""
+    batch: spool_format.ReadBatch | None = None
+    position = reader.cursor.position
+    while batch is None or not (batch.complete or position >= last):
+        until = min(last, position + spool_format.RECORDS_AT_ONCE)
+        batch = reader.read(last=until, events_max=events_max, bytes_max=bytes_max, partial=batch)
+        position = batch.after.position
+        await asyncio.sleep(0)
+    return batch
 
 
 # === live source ==============================================================================================
@@ -479,7 +512,7 @@ class LiveSource:
             if last > self.supplied:
                 try:
                     with spool.wrap_os_errors(self.folder):
-                        batch = self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
+                        batch = await read_in_parts(self._reader, last, events_max=events_max, bytes_max=bytes_max)
                 except (SpoolDamaged, SpoolUnavailable):
                     if self.is_alive:
                         raise

@@ -28,7 +28,6 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from hashlib import sha256
-from itertools import chain
 from types import MappingProxyType
 from typing import Final, NamedTuple, Protocol
 
@@ -301,8 +300,9 @@ class _Plan(NamedTuple):
 class Appending:
     """One batch and its append; use it once. Digests are stored only if `digests` is given.
 
-    `witness` is an episode and its confirmed head. A new episode gets its number in `numbers` if no other has it. What
-    was erased or archived is not stored again; with `restoring`, archived episodes are, under their numbers.
+    Calls `on_wait` when the database begins to store the events. `witness` is an episode and its confirmed head. A new
+    episode gets its number in `numbers` if no other has it. What was erased or archived is not stored again; with
+    `restoring`, archived episodes are, under their numbers.
     With `are_stored` the events are in the log already, behind the heads of their episodes, which `write` advances.
     """
 
@@ -312,11 +312,13 @@ class Appending:
         records: Sequence[Record],
         digests: RunningDigests | None = None,
         *,
+        on_wait: Callable[[], None] = lambda: None,
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
         restoring: bool = False,
         are_stored: bool = False,
     ) -> None:
+        self._on_wait = on_wait
         self._restoring = restoring
         self._are_stored = are_stored
         self._dialect = dialect
@@ -359,8 +361,10 @@ class Appending:
             self.warnings = warnings_of(changed)
         if any(each.fresh for each in plan.steps.values()):
             if self._are_stored:
-                deque(chain.from_iterable(plan.insertion.values()), 0)  # computes the digests
+                [parts] = plan.insertion.values()
+                deque(parts, 0)  # computes the digests
             else:
+                self._on_wait()
                 try:
                     await dialect.insert(connection, plan.insertion)
                 except RowRefused as error:

@@ -14,7 +14,7 @@ import os
 import sqlite3
 import stat
 import uuid
-from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
@@ -137,19 +137,23 @@ class EventLog:
 
     # --- append -----------------------------------------------------------------------------------------------
 
-    async def append(self, records: Sequence[Record]) -> dict[EpisodeId, str]:
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> dict[EpisodeId, str]:
         """Store a batch in one transaction, durable on return; return the reasons of refusals by episode.
 
+        Calls `on_wait` when a server stores the events, while this process waits most of the time.
         Records stored before with the same bytes are stored once. Of an episode with a gap, or with a record that no
         database can hold, the records before it are stored; the caller must keep the rest and append it later. Raises
         `LogDamaged`, and stores nothing, if another event is stored under a record's key.
         """
-        return dict((await self.store(records)).refusals)
+        return dict((await self.store(records, on_wait=on_wait)).refusals)
 
     async def store(
         self,
         records: Sequence[Record],
         *,
+        on_wait: Callable[[], None] = lambda: None,
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
     ) -> storeds.Stored:
@@ -162,12 +166,12 @@ class EventLog:
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
             if not await self._has_shards():
-                return await self._append(records, witness=witness, numbers=numbers)
+                return await self._append(records, on_wait=on_wait, witness=witness, numbers=numbers)
             async with self.writing() as connection:  # before an event with its number is on a shard
                 rows = appends.Appending(self._dialect, records, numbers=numbers, restoring=self.blobs.restores)
                 await rows.create_rows(connection)
             try:
-                return await self._append(records, witness=witness, numbers=numbers)
+                return await self._append(records, on_wait=on_wait, witness=witness, numbers=numbers)
             except appends.StoredAhead:
                 await self._adopt({each.episode for each in records if each.episode is not None})
                 return await self._append(records, witness=witness, numbers=numbers)
@@ -190,6 +194,7 @@ class EventLog:
         self,
         records: Sequence[Record],
         *,
+        on_wait: Callable[[], None] = lambda: None,
         witness: tuple[EpisodeId, int] | None = None,
         numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
         are_stored: bool = False,
@@ -198,6 +203,7 @@ class EventLog:
             self._dialect,
             records,
             self.digests,
+            on_wait=(lambda: None) if self.address.is_sqlite else on_wait,
             witness=witness,
             numbers=numbers,
             restoring=self.blobs.restores,

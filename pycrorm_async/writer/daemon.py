@@ -183,8 +183,8 @@ class Daemon:
         finally:
             await drain.run_to_completion(self._release(tracker, fault))
 
-    async def _append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._availability.observe(self._log.append(records))
+    async def _append(self, records: Sequence[Record], on_wait: Callable[[], None]) -> Mapping[EpisodeId, str]:
+        return await self._availability.observe(self._log.append(records, on_wait))
 
     async def _release(self, tracker: VisibilityTracker, fault: str | None) -> None:
         name, state, retried = tracker.source.name, tracker.drain.state, True

@@ -94,7 +94,7 @@ BATCH_BYTES_MAX: Final = 4 * 2**20
 _BATCH_AGE_S: Final = 0.05
 """Bounds the time for which a batch gathers events: a transaction for each event would cost more than the wait."""
 _T = TypeVar("_T")
-Append: TypeAlias = Callable[[Sequence[Record]], Coroutine[Any, Any, Mapping[EpisodeId, str]]]
+Append: TypeAlias = Callable[[Sequence[Record], Callable[[], None]], Coroutine[Any, Any, Mapping[EpisodeId, str]]]
 """`Log.append`, or a function that calls it."""
 
 
@@ -127,7 +127,8 @@ class DrainState(NamedTuple):
 class Drain:
     """A drain of one source into one log. Belongs to the loop that runs it; `state` is readable from any thread.
 
-    Calls `append` with each batch, and `on_append` when the batch is acknowledged.
+    Calls `append` with each batch, and `on_append` when the batch is acknowledged. Reads the next batch while a server
+    stores this one.
     """
 
     def __init__(
@@ -156,6 +157,7 @@ class Drain:
         """Why the source could not keep refused records; no position from them on is acknowledged."""
         self._changed = asyncio.Condition()
         self._finished = False
+        self._reading: asyncio.Task[Sequence[Record]] | None = None
 
     async def run(self) -> None:
         """Drain until the source is closed and empty.
@@ -164,11 +166,7 @@ class Drain:
         source's `fail` first; reporting the error to the user is up to the caller.
         """
         try:
-            while batch := await self._source.get_batch(
-                events_max=self._settings.batch_events_max,
-                bytes_max=BATCH_BYTES_MAX,
-                age_s_max=_BATCH_AGE_S,
-            ):
+            while batch := await self._next_batch():
                 refusals = await self._append(batch)
                 await self._acknowledge(await self._safe_position(batch, refusals))
                 name, batches = self._source.name, self.state.batches + 1  # a queue that moves gets another name
@@ -179,6 +177,9 @@ class Drain:
             self._source.fail(_failure_reason(error))
             raise
         finally:
+            if self._reading is not None:
+                self._reading.cancel()
+                await asyncio.gather(self._reading, return_exceptions=True)
             self._finished = True
             await self._notify()
 
@@ -194,9 +195,25 @@ class Drain:
             await self._changed.wait_for(lambda: self._finished or self.state.appended >= position)
         return self.state.appended >= position
 
+    async def _next_batch(self) -> Sequence[Record]:
+        self._read_ahead()
+        reading, self._reading = self._reading, None
+        assert reading is not None
+        return await reading
+
+    def _read_ahead(self) -> None:
+        """Begin to read the next batch, also while the database stores this one."""
+        if self._reading is None:
+            batch = self._source.get_batch(
+                events_max=self._settings.batch_events_max,
+                bytes_max=BATCH_BYTES_MAX,
+                age_s_max=_BATCH_AGE_S,
+            )
+            self._reading = asyncio.create_task(batch, name="pycrorm read batch")
+
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
         refusals = await retry(
-            lambda: run_to_completion(self._append_records(batch)),
+            lambda: run_to_completion(self._append_records(batch, self._read_ahead)),
             backoff=self._backoff,
             on_unavailable=self._mark_unavailable,
             randomness=self._randomness,
@@ -284,6 +301,7 @@ class Source(Protocol):
 
         Waits for the first record, then at most `age_s_max` for more. Returns an empty sequence once the queue is
         closed and drained. A source supplies each record once; the next source supplies unacknowledged records again.
+        One call waits at a time, also while the records of the call before are not acknowledged yet.
         """
         ...
 
@@ -307,9 +325,12 @@ class Source(Protocol):
 class Log(Protocol):
     """The log in a database."""
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
         """Append records, durable on return. Records stored before with the same bytes are stored once.
 
+        Calls `on_wait` when a server stores them and this process waits for it; it may read the next records then.
         Returns the episodes with refused records (behind a gap, or with content no database can hold) and the reasons:
         the caller must keep these records; other episodes are not affected. Raises `DatabaseUnavailable`; then the same
         call may be repeated. Raises `LogDamaged` if another event is stored under a record's key.

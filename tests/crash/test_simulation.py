@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -42,11 +42,13 @@ class _FaultyLog(ForwardingDestination):
         super().__init__(CountingFold(log))
         self._rng = rng
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
         chance = self._rng.random()
         if chance < 0.2:
             raise DatabaseUnavailable("unavailable before the append")
-        refused = await super().append(records)
+        refused = await super().append(records, on_wait)
         if chance < 0.4:
             raise DatabaseUnavailable("the reply to the COMMIT was lost")
         return refused

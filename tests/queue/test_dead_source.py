@@ -5,7 +5,7 @@ import errno
 import os
 import shutil
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,12 +13,11 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
-from pycrorm_async.queue import Spool, open_dead, sources
+from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.format import CHECKSUM, EVENT, Frame, encode, salt_of, segment_numbers
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.maintenance import repair_folder
-from pycrorm_async.queue.scan import ValidPrefix, scan, seal, tails
-from pycrorm_async.queue.sources import computed_ends
+from pycrorm_async.queue.scan import scan, seal, sync_segments, tails
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
@@ -464,25 +463,24 @@ async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(sp
     assert not author.folder.exists()
 
 
-async def test_a_folder_is_not_deleted_while_the_scan_of_a_cancelled_task_reads_its_last_records(
+async def test_a_folder_is_not_deleted_while_the_thread_of_a_cancelled_task_syncs_its_last_records(
     spool: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     author = long_folder(spool)
-    is_reading, goes_on = threading.Event(), threading.Event()
+    is_syncing, goes_on = threading.Event(), threading.Event()
 
-    def computed_slowly(prefix: ValidPrefix) -> tuple[Record, ...]:
-        is_reading.set()
-        assert goes_on.wait(60)
-        return computed_ends(prefix)
+    def sync_slowly(folder: Path, numbers: Sequence[int]) -> None:
+        if numbers[0] == SEGMENTS:
+            is_syncing.set()
+            assert goes_on.wait(60)
+        sync_segments(folder, numbers)
 
-    monkeypatch.setattr(sources, "computed_ends", computed_slowly)
+    monkeypatch.setattr("pycrorm_async.queue.scan.sync_segments", sync_slowly)
     recovered = open_dead(author.folder)
     assert recovered is not None
     synced = max(range(0, RECORDS, SYNCED_EVERY))
-    await recovered.get_batch(events_max=synced, bytes_max=2**22, age_s_max=0.0)
-    await recovered.acknowledge(synced)
-    reading = asyncio.create_task(recovered.get_batch(events_max=1, bytes_max=2**22, age_s_max=0.0))
-    assert await asyncio.to_thread(is_reading.wait, 60)
+    reading = asyncio.create_task(recovered.get_batch(events_max=synced, bytes_max=2**22, age_s_max=0.0))
+    assert await asyncio.to_thread(is_syncing.wait, 60)
     reading.cancel()
     with pytest.raises(asyncio.CancelledError):
         await reading

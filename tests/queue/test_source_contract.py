@@ -15,6 +15,7 @@ import pytest
 from pycrorm_async.errors import SpoolStuck
 from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, Spool, open_dead
+from pycrorm_async.queue import format as spool_format
 from pycrorm_async.queue.format import EVENT, read_segment, segment_path
 from pycrorm_async.queue.scan import survey
 from pycrorm_async.queue.spool import DrainNote, DrainStatus
@@ -37,11 +38,13 @@ class SourceCase:
         self._left: Path | None = None
         self._opened: list[AnySource] = []
 
-    async def record(self, sizes: Sequence[int] = SIZES) -> None:
+    async def record(self, sizes: Sequence[int] = SIZES, *, synced_every: int = 1000) -> None:
         """Record and sync one whole episode."""
         for index, size in enumerate(sizes):
             heading = started() if index == 0 else ended() if index == len(sizes) - 1 else node()
             self.queue.put_nowait(heading, b"%04d" % index + b"x" * size)
+            if index % synced_every == synced_every - 1:
+                await self.queue.synced_to()
         await self.queue.synced_to()
 
     def source(self) -> AnySource:
@@ -153,6 +156,43 @@ async def test_a_batch_holds_at_most_this_many_bytes_and_a_larger_record_comes_a
     source = scene.source()
     sizes = [positions(await batch(source, bytes_max=25)) for _ in range(4)]
     assert sizes == [[1, 2], [3], [4], [5, 6]]
+
+
+async def test_other_tasks_run_while_a_batch_is_read(scene: SourceCase, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spool_format, "RECORDS_AT_ONCE", 2)
+    await scene.record(synced_every=3)
+    source = scene.source()
+    await batch(source, events_max=1)  # takes the lock
+    reading = asyncio.create_task(batch(source, events_max=40))
+    turns: list[int] = []
+    while not reading.done():
+        await asyncio.sleep(0)
+        # A dead source also waits for a thread that syncs, so count the turns in which it has read.
+        turns.append(len(source._ready) if isinstance(source, DeadSource) else len(turns))
+    assert positions(reading.result()) == list(range(2, 42))
+    assert len(set(turns)) > 10
+
+
+async def test_a_batch_whose_reading_was_cancelled_is_supplied_by_the_next_call(
+    scene: SourceCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_format, "RECORDS_AT_ONCE", 2)
+    await scene.record(synced_every=3)
+    scene.queue.close()
+    source = scene.source()
+    records: list[Record] = []
+    for turns in range(30):
+        reading = asyncio.create_task(batch(source, events_max=20))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        if not reading.done():
+            reading.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await reading
+        else:
+            records += reading.result()
+    records += await rest(source)
+    assert positions(records) == list(range(1, len(SIZES) + 1))
 
 
 async def test_after_the_last_record_of_a_closed_queue_every_batch_is_empty(scene: SourceCase) -> None:

@@ -112,8 +112,10 @@ class CountingFold(Destination):
     def __init__(self, log: EventLog) -> None:
         self.log = log
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self.log.append(records)
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
+        return await self.log.append(records, on_wait)
 
     async def confirm(self) -> None:
         """Nothing has to be confirmed."""
@@ -136,8 +138,10 @@ class ForwardingDestination(Destination):
     def __init__(self, destination: Destination) -> None:
         self._destination = destination
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._destination.append(records)
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
+        return await self._destination.append(records, on_wait)
 
     async def confirm(self) -> None:
         await self._destination.confirm()
@@ -154,8 +158,10 @@ class LosesReplies(ForwardingDestination):
 
     lost = False
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        refusals = await super().append(records)
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
+        refusals = await super().append(records, on_wait)
         self.lost = not self.lost
         if self.lost:
             raise DatabaseUnavailable("the connection was closed before the reply came")

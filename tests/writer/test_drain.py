@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -48,9 +48,11 @@ async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next
     seen: list[str] = []
 
     class NotingLog(ForwardingDestination):
-        async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        async def append(
+            self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+        ) -> Mapping[EpisodeId, str]:
             seen.append(f"append to {records[-1].position} with {source.acknowledgements} acknowledged")
-            return await super().append(records)
+            return await super().append(records, on_wait)
 
     class NotingSource(KeptSource):
         async def acknowledge(self, position: int) -> None:
@@ -66,6 +68,54 @@ async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next
         "append to 20 with [10] acknowledged",
         "acknowledge 20 with 20 stored",
     ]
+
+
+class StoringLog(ForwardingDestination):
+    """Say that a server stores each batch, and store it only then; twice, as an append that is repeated does."""
+
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
+        for _ in range(2):
+            on_wait()
+            await asyncio.sleep(0)
+        return await super().append(records, on_wait)
+
+
+async def test_the_next_batch_is_read_once_while_a_server_stores_this_one(log: EventLog) -> None:
+    seen: list[str] = []
+
+    class NotingSource(KeptSource):
+        async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+            batch = await super().get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+            seen.append(f"read to {batch[-1].position}" if batch else "read nothing")
+            return batch
+
+        async def acknowledge(self, position: int) -> None:
+            seen.append(f"acknowledge {position}")
+            await super().acknowledge(position)
+
+    source = NotingSource(run_of(episode(1), 1, 25), closed=True)
+    await Drain(source, StoringLog(CountingFold(log)).append, settings=TENS).run()
+    assert seen[:4] == ["read to 10", "read to 20", "acknowledge 10", "read to 25"]
+    assert seen[4:] == ["acknowledge 20", "read nothing", "acknowledge 25"]
+    assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
+
+
+async def test_damage_that_is_met_while_a_server_stores_a_batch_is_raised_when_that_batch_is_acknowledged(
+    log: EventLog,
+) -> None:
+    class DamagedSource(KeptSource):
+        async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+            if self._given:
+                raise SpoolDamaged(Path("00000001.segment"), 64, "its checksum is wrong")
+            return await super().get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+
+    source = DamagedSource(run_of(episode(1), 1, 25))
+    with pytest.raises(SpoolDamaged):
+        await Drain(source, StoringLog(CountingFold(log)).append, settings=TENS).run()
+    assert source.acknowledgements == [10]
+    assert ask(log.address.path, STORED) == [(1, 10, 1, 10)]
 
 
 async def test_a_commit_whose_reply_is_lost_is_stored_once(log: EventLog) -> None:
@@ -259,9 +309,12 @@ class PausingLog(ForwardingDestination):
         super().__init__(CountingFold(log))
         self._points = points
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+    async def append(
+        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+    ) -> Mapping[EpisodeId, str]:
+        on_wait()
         await self._points.pause_at("before append")
-        refusals = await super().append(records)
+        refusals = await super().append(records, on_wait)
         await self._points.pause_at("after append")
         return refusals
 

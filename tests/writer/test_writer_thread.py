@@ -258,10 +258,12 @@ async def test_a_cancelled_flush_stops_the_wait_and_not_the_work(address: Databa
     entered, release = threading.Event(), threading.Event()
 
     class Slow(ForwardingDestination):
-        async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        async def append(
+            self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
+        ) -> Mapping[EpisodeId, str]:
             entered.set()
             await asyncio.to_thread(release.wait)
-            return await super().append(records)
+            return await super().append(records, on_wait)
 
     source = KeptSource(run_of(episode(1), 1, 5))
     writer = WriterThread(
