@@ -5,7 +5,8 @@ these names, and a log stores a declaration once only if old and new recorders w
 moves within the package keeps the name under which it was recorded first.
 """
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 _PACKAGE: Final = "pycrorm_async"
 _MOVED: Final = {
@@ -44,7 +45,12 @@ _RECORDED_NAMES: Final = {
 }
 
 
+class_name: Final[Callable[[Any], str]] = type.__dict__["__name__"].__get__
+"""Returns the `__name__` of a class, also of one whose metaclass has a `__name__` that raises."""
+_module, _qualified_name = (type.__dict__[name].__get__ for name in ("__module__", "__qualname__"))
+
+
 def recorded_name(kind: type) -> str:
     """Return the module and the name under which events and declarations name a class."""
-    path = f"{kind.__module__}.{kind.__qualname__}"
+    path = f"{_module(kind)}.{_qualified_name(kind)}"
     return _RECORDED_NAMES.get(path, path)

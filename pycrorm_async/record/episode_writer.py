@@ -36,6 +36,7 @@ from pycrorm_async.record.declarations import Declared, DeclaredType
 from pycrorm_async.record.event_feed import EventFeed
 from pycrorm_async.record.opening import EPISODE_TEXT_MAX, EpisodeOpening, end_statuses, episode_started
 from pycrorm_async.record.recorded_before import RecordedBefore
+from pycrorm_async.recorded_names import class_name
 
 if TYPE_CHECKING:
     from pycrorm_async.record.geometry import Descriptions
@@ -504,7 +505,7 @@ class Emitter:
         """Count an exception of the hooks, and log it when the count is a power of two, so that the log stays short."""
         self._fault_count += 1
         reason = live_values.cut(live_values.clean(live_values.message_of(error)), _REASON_MAX)
-        self._last_fault = f"{where}: {type(error).__name__}: {reason}"
+        self._last_fault = f"{where}: {class_name(type(error))}: {reason}"
         if self._fault_count & (self._fault_count - 1) == 0:
             _log.error("a fault of recording (%d so far): %s", self._fault_count, self._last_fault)
             _log.debug("traceback of the fault of recording", exc_info=error)

@@ -33,7 +33,7 @@ from weakref import ReferenceType, ref
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import clean as clean
 from pycrorm_async.events.codec import unwritable
-from pycrorm_async.recorded_names import recorded_name
+from pycrorm_async.recorded_names import class_name, recorded_name
 from pycrorm_async.visible_text import visible
 
 REASON_MAX = 500
@@ -192,7 +192,7 @@ def encode_or_missing(value: Any, references: References) -> Any:
 def missing_value(reason: str, value: Any) -> event_types.MissingValue:
     """Build the `MissingValue` that replaces a value, with a shortened reason and repr."""
     return event_types.MissingValue(
-        cut(clean(reason), REASON_MAX), clean_repr(value.value if isinstance(value, RefusedValue) else value)
+        cut(clean(reason), REASON_MAX), clean_repr(value.value if type(value) is RefusedValue else value)
     )
 
 
@@ -269,7 +269,7 @@ def _encode_real(value: Any, _enum: type[Enum] | None, _references: References) 
         try:
             value = float.__float__(value) if isinstance(value, float) else float(value)
         except (TypeError, ValueError, OverflowError) as error:
-            raise UnrecordableValue(f"declared as float, got a {type(value).__name__}: {error}") from None
+            raise UnrecordableValue(f"declared as float, got a {class_name(type(value))}: {error}") from None
     if not math.isfinite(value):
         raise UnrecordableValue(f"{value} is not a finite number")
     return float.__float__(value)
@@ -310,7 +310,7 @@ def _encode_member(value: Any, enum: type[Enum] | None, references: References) 
     # `Enum.name` takes ten times as long.
     name = value._name_ if is_member or isinstance(value, Enum) else value.name
     if not isinstance(name, str):
-        raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {type(value).__name__}")
+        raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {class_name(type(value))}")
     writable: str = _require_writable(name)
     return writable
 
@@ -407,7 +407,7 @@ def _encode_key(key: Any) -> str:
     if isinstance(key, Enum):
         return str(key.name)
     if not isinstance(key, str):
-        raise UnrecordableValue(f"a key of the dict is a {type(key).__name__}, not a str")
+        raise UnrecordableValue(f"a key of the dict is a {class_name(type(key))}, not a str")
     return str(_require_writable(key))
 
 
@@ -559,7 +559,7 @@ class ValueReader:
     def _blob(self, value: event_types.Blob) -> event_types.BlobReference:
         content, media_type = cast("tuple[object, object]", value)  # unchecked by the caller
         if not isinstance(content, bytes | bytearray | memoryview):
-            raise UnrecordableValue(f"the content of a blob must be bytes, not {type(content).__name__}")
+            raise UnrecordableValue(f"the content of a blob must be bytes, not {class_name(type(content))}")
         if not isinstance(media_type, str) or len(media_type) > _MEDIA_TYPE_MAX or unwritable(media_type):
             raise UnrecordableValue(f"the media type of a blob must be a str of at most {_MEDIA_TYPE_MAX} characters")
         return self._put(bytes(content), media_type)
@@ -585,11 +585,11 @@ def _as_built_in(value: str | float) -> str | int | float:
 
 
 def _mismatch(declared: str, value: Any) -> UnrecordableValue:
-    if isinstance(value, RefusedValue):
+    if type(value) is RefusedValue:  # `isinstance` reads an attribute, which may raise
         return UnrecordableValue(value.reason)
     if declared == "JSON":
-        return UnrecordableValue(f"JSON cannot hold a {type(value).__name__}")
-    return UnrecordableValue(f"declared as {declared}, got a {type(value).__name__}")
+        return UnrecordableValue(f"JSON cannot hold a {class_name(type(value))}")
+    return UnrecordableValue(f"declared as {declared}, got a {class_name(type(value))}")
 
 
 # === texts ====================================================================================================
@@ -607,7 +607,7 @@ _TEXT_MAX = 150
 def reading_fault(error: BaseException) -> str:
     """Return the reason why a value was not recorded, if reading the value raised `error`."""
     message = cut(clean(message_of(error)), _REPR_MAX)
-    return f"reading it raised {type(error).__name__}{': ' if message else ''}{message}"
+    return f"reading it raised {class_name(type(error))}{': ' if message else ''}{message}"
 
 
 def message_of(failure: BaseException) -> str:
@@ -615,7 +615,7 @@ def message_of(failure: BaseException) -> str:
     try:
         return str(failure)
     except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
-        return f"<its __str__ raised {type(error).__name__}>"
+        return f"<its __str__ raised {class_name(type(error))}>"
 
 
 def cut(text: str, characters_max: int) -> str:
@@ -654,7 +654,7 @@ class _Brief(Repr):
                 return repr(kind(x[:_TEXT_MAX])) + _cut_mark(len(x), "bytes")
             return super().repr1(x, level)
         except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
-            return f"<a {type(x).__name__} whose repr raised {type(error).__name__}>"
+            return f"<a {class_name(type(x))} whose repr raised {class_name(type(error))}>"
 
     def repr_instance(self, x: Any, level: int) -> str:  # noqa: ARG002  `Repr` gives the signature
         return str.__str__(repr(x))

@@ -272,6 +272,40 @@ async def test_nodes_of_a_class_that_cannot_be_declared_are_recorded_without_a_t
     assert "'pose', which the memory itself uses" in str(case.emitter.missing.count.last)
 
 
+class Nameless(type):
+    """The class of classes that raise where their names are read."""
+
+    def __getattribute__(cls, name: str) -> Any:
+        if nasty.get() and name in ("__name__", "__qualname__", "__module__"):
+            raise RuntimeError(f"no {name}")
+        return super().__getattribute__(name)
+
+
+class NamelessValue(metaclass=Nameless):
+    """A value whose class has no name that can be read."""
+
+
+class NamelessError(Exception, metaclass=Nameless):
+    """An error whose class has no name that can be read."""
+
+
+async def test_nodes_end_although_the_names_of_classes_cannot_be_read(tmp_path: Path) -> None:
+    anything: dict[str, Any] = dict.fromkeys(
+        "integer real text flag arm pose thing texts reals odd".split(), NamelessValue()
+    )
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        async with memory.episode(description="nameless"):
+            nasty.set(True)
+            await AnythingActionPerformable(**anything, inner=Inner()).perform()
+            with pytest.raises(NamelessError):
+                await AnythingActionPerformable(**anything, inner=Inner(), _raised=NamelessError("too dark")).perform()
+            nasty.set(False)
+        await memory.flush()
+        assert memory.status.faults.total == 0
+        ends = [(each.status, each.reason, each.failure_message) for each in await memory.tree(1)]
+    assert ends[1:] == [("SUCCEEDED", None, None), ("ERROR", "NamelessError", "too dark")]
+
+
 def test_warnings_are_bounded_by_a_number_of_fields(caplog: pytest.LogCaptureFixture) -> None:
     values = missing_values.MissingValues()
     for number in range(missing_values.WARNED_MAX + 50):
