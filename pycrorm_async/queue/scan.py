@@ -449,7 +449,10 @@ def _all_committed(folder: Path, recorder: bytes) -> bool:
     """Return whether a commit frame covers the last whole record, so that the folder need not be surveyed."""
     committed = 0
     for number in reversed(spool_format.segment_numbers(folder)):
-        buffer = spool_format.read_segment(spool_format.segment_path(folder, number))
+        path = spool_format.segment_path(folder, number)
+        if not spool_format.is_begun(path):
+            continue
+        buffer = spool_format.read_segment(path)
         for frame in _last_frames(buffer, spool_format.salt_of(recorder, number)):
             if frame.kind != spool_format.COMMIT:
                 return frame.position <= committed
