@@ -103,8 +103,13 @@ _BEGIN = (
 _MAY_TAKE = f"""
 SELECT quote_ident(session_user) AS login,
     has_schema_privilege(to_regrole('{READER}'), '{VIEWS_SCHEMA}', 'USAGE') AS exists,
-    pg_has_role(session_user, to_regrole('{READER}'), 'MEMBER') AS is_member"""
-"""Selects whether this memory has the role of readers, and whether the login may take it."""
+    pg_has_role(session_user, to_regrole('{READER}'), 'MEMBER') AS is_member,
+    pg_has_role(session_user, to_regrole('{READER}'),
+        CASE WHEN current_setting('server_version_num')::int < 160000 THEN 'MEMBER' ELSE 'SET' END) AS may_take"""
+"""Selects whether this memory has the role of readers, and whether the login may take it.
+
+From PostgreSQL 16 on a member of a role may lack the right to take it.
+"""
 
 _VOLATILE = f"""
 SELECT 'function ' || f.proname FROM pg_proc AS f JOIN pg_namespace ON pg_namespace.oid = f.pronamespace
@@ -178,10 +183,11 @@ class _Cursor:
         role = await self._connection.fetchrow(_MAY_TAKE)
         if not role or not role["exists"]:
             raise QueryRefused(f"a query in SQL runs as the role {READER}: run `pycrorm roles --create` once")
-        if not role["is_member"]:
-            login = role["login"]
+        if not role["may_take"]:
+            login, option = role["login"], " WITH SET TRUE" if role["is_member"] else ""
             raise QueryRefused(
-                f"a query in SQL runs as the role {READER}, which {login} may not take: GRANT {READER} TO {login}"
+                f"a query in SQL runs as the role {READER}, which {login} may not take:"
+                f" GRANT {READER} TO {login}{option}"
             )
         await self._connection.execute(f"SET LOCAL ROLE {READER}")
 

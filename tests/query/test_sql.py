@@ -208,6 +208,10 @@ async def test_a_query_runs_as_the_reader_and_a_login_that_may_not_take_this_rol
     async with opened_reader(login(url, "IN ROLE pycrorm_recorder")) as sql:
         with pytest.raises(QueryRefused, match=r'which "login-.*" may not take: GRANT pycrorm_reader TO "login-.*"$'):
             await sql.query(who)
+    member = login(url, "IN ROLE pycrorm_recorder", "GRANT pycrorm_reader TO {name} WITH SET FALSE")
+    async with opened_reader(member) as sql:
+        with pytest.raises(QueryRefused, match=r'GRANT pycrorm_reader TO "login-.*" WITH SET TRUE$'):
+            await sql.query(who)
     body = "$$ BEGIN PERFORM set_config('role', 'none', true); RETURN current_user; END $$"
     leave = f"CREATE FUNCTION public.leave() RETURNS text IMMUTABLE LANGUAGE plpgsql AS {body}"
     owner = login(url, "IN ROLE pycrorm_reader", "ALTER SCHEMA pycrorm OWNER TO {name}", leave)
