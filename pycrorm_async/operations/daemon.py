@@ -15,9 +15,11 @@ daemon stops, because it would keep writing to the old file, which no longer has
 
 import asyncio
 import os
+import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -43,6 +45,11 @@ from pycrorm_async.store.address import DatabaseAddress, shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
 from pycrorm_async.writer.drain import ClaimedSource, ScanResult, TablesPort
+
+_SCAN_S_MAX: Final = 1.0
+"""The time after which a spool is scanned although it has not changed: its file system may not note every change."""
+_SAME_TIME_NS: Final = 50_000_000
+"""The time in which two changes of a folder may have the same time: some ticks of the kernel's clock."""
 
 
 async def serve(
@@ -130,6 +137,16 @@ class Folders:
         self._file = address.path if address.is_sqlite else None
         self._opened = _identity(self._file)
         self._taken: set[str] = set()
+        self._scanned: tuple[float, int | None, Collection[str]] = 0.0, None, ()  # when, and what it would find again
+
+    def is_due(self, but: Collection[str]) -> bool:
+        scanned_s, changed_ns, names = self._scanned
+        if time.monotonic() > scanned_s + _SCAN_S_MAX or changed_ns is None or {*but} != names:
+            return True
+        try:
+            return self._spool.path.stat().st_mtime_ns != changed_ns
+        except OSError:  # which the scan reports
+            return True
 
     def __call__(self, but: Collection[str]) -> ScanResult:
         # A missing file may be put back, so it is no error here. With another file in its place, this process would
@@ -138,6 +155,7 @@ class Folders:
             raise DatabaseForeign(f"{self._file} was replaced while it was open: start `pycrorm writer` again")
         claimed: list[ClaimedSource] = []
         failed: dict[str, Exception] = {}
+        began_s, changed_ns = time.monotonic(), _changed_ns(self._spool.path)
         present = self._spool.recorders()
         self._taken &= {each.name for each in present}
         folders = [each for each in present if each.name not in but and self._is_ours(each)]
@@ -152,6 +170,8 @@ class Folders:
                 if source is not None:
                     claimed.append(source)
                     self._taken.add(folder.name)
+        names = {*but, *(each.name for each in claimed)}
+        self._scanned = began_s, changed_ns if len(claimed) == len(folders) else None, names
         return ScanResult(claimed, failed)
 
     def _is_ours(self, folder: RecorderFolder) -> bool:
@@ -163,6 +183,15 @@ class Folders:
             return LiveSource.take(folder.path)
         # Check a folder that comes back whole: damage further on would make the daemon store its start each time.
         return open_dead(folder.path, stored=self._stored, check=folder.name in self._taken)
+
+
+def _changed_ns(folder: Path) -> int | None:
+    """Return when entries of the folder were added or removed; None if the next ones may get the same time."""
+    try:
+        changed_ns = folder.stat().st_mtime_ns
+    except OSError:
+        return None
+    return changed_ns if SYSTEM_CLOCK.wall_ns() - changed_ns > _SAME_TIME_NS else None
 
 
 def _identity(file: Path | None) -> FileIdentity | None:

@@ -420,14 +420,23 @@ class PostgreSQL(dialect.Dialect):
             raise
         return True
 
+    async def fetch(self, connection: AsyncConnection, sql: str, parameters: tuple[Any, ...]) -> Sequence[Any]:
+        # The driver prepares a statement once, and SQLAlchemy each time; but only the latter begins a transaction.
+        adapted = (await connection.get_raw_connection()).dbapi_connection
+        assert adapted is not None
+        if adapted.autocommit:
+            rows: Sequence[Any] = await (await _driver(connection)).fetch(sql, *parameters)
+            return rows
+        return await super().fetch(connection, sql, parameters)
+
     async def join_fold_group(self, connection: AsyncConnection, look: int) -> tuple[int, Mapping[int, int | None]]:
-        await connection.exec_driver_sql(SHOW_LOOK, (look,))
-        rows = [tuple(row) for row in await connection.exec_driver_sql(SELECT_LOOKS)]
+        await self.fetch(connection, SHOW_LOOK, (look,))
+        rows = await self.fetch(connection, SELECT_LOOKS, ())
         if any(is_own for _, _, is_own in rows):
-            await connection.exec_driver_sql(FORGET_LOOK, (look - 1,))
+            await self.fetch(connection, FORGET_LOOK, (look - 1,))
         else:
-            await connection.exec_driver_sql(JOIN_FOLDING)
-            rows = [tuple(row) for row in await connection.exec_driver_sql(SELECT_LOOKS)]
+            await self.fetch(connection, JOIN_FOLDING, ())
+            rows = await self.fetch(connection, SELECT_LOOKS, ())
         [own] = [process for process, _, is_own in rows if is_own]
         return own, {process: number for process, number, _ in rows}
 

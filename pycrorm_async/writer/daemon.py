@@ -126,6 +126,8 @@ class Daemon:
         now_s = self._now_s()
         resting = {name for name, (_, until_s) in self._rests.items() if until_s > now_s}
         excluded = self._serving.keys() | resting
+        if not self._scan.is_due(excluded):
+            return []
         result = drain.ScanResult([], {})
 
         def scan() -> None:

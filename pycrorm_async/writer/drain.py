@@ -486,8 +486,16 @@ class ScanResult(NamedTuple):
     failed: Mapping[str, Exception]
 
 
-SourceScanner: TypeAlias = Callable[[Collection[str]], ScanResult]
-"""Claims every recorder's folder that can be drained, except those of these names. Reads files: blocks."""
+class SourceScanner(Protocol):
+    """Claims the recorders' folders of a spool."""
+
+    def is_due(self, but: Collection[str]) -> bool:
+        """Return whether a scan may have another result than the last one. Takes microseconds."""
+        ...
+
+    def __call__(self, but: Collection[str]) -> ScanResult:
+        """Claim every recorder's folder that can be drained, except those of these names. Reads files: blocks."""
+        ...
 
 
 # === drain once ===============================================================================================

@@ -253,14 +253,14 @@ async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(
                 if "has ended" in line:
                     leave.set()
 
-            look = Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
+            class NotedFolders(Folders):
+                def __call__(self, but: Collection[str]) -> ScanResult:
+                    result = super().__call__(but)
+                    held.extend(result.held)
+                    return result
 
-            def scan_and_note(but: Collection[str]) -> ScanResult:
-                result = look(but)
-                held.extend(result.held)
-                return result
-
-            await Daemon(destination, destination, scan_and_note, settings=SETTINGS, report=report).run(leave)
+            folders = NotedFolders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
+            await Daemon(destination, destination, folders, settings=SETTINGS, report=report).run(leave)
 
         async def round_(at: int) -> bool:
             script = script_of(at)
