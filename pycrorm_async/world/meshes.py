@@ -59,7 +59,7 @@ def _read_obj(content: bytes) -> Mesh:
     vertices: list[tuple[float, float, float]] = []
     faces: list[tuple[int, int, int]] = []
     for line in content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
-        kind, *words = line.split() or (b"",)
+        kind, *words = line.partition(b"#")[0].split() or (b"",)
         if kind == b"v":
             x, y, z = map(float, words[:3])
             vertices.append((x, y, z))
@@ -133,8 +133,9 @@ def _points(path: str, _status: FileStatus) -> NDArray[np.float64]:
 def for_bullet(path: str, *, collision: bool) -> bytes | None:
     """Return a binary STL of a mesh file that Bullet cannot read right; None for a file that it can.
 
-    That is an OBJ without continued lines or a binary STL. Bullet collides with the hull of the points. Its reader of
-    Collada is not used, because it ends the process where a file differs from what it expects, as a damaged OBJ does.
+    It reads a binary STL, and an OBJ without continued lines and comments behind numbers. Bullet collides with the hull
+    of the points. Its reader of Collada is not used, because it ends the process where a file differs from what it
+    expects, as a damaged OBJ does.
 
     Raises `ValueError` with the path for a file that `read_mesh` refuses.
     """
@@ -142,7 +143,7 @@ def for_bullet(path: str, *, collision: bool) -> bytes | None:
     if suffix == ".stl" and _is_binary(path):
         return None
     points = mesh_points(path)
-    if suffix == ".obj" and _CONTINUED.search(Path(path).read_bytes()) is None:
+    if suffix == ".obj" and _MISREAD_OBJ.search(Path(path).read_bytes()) is None:
         return None
     if collision:
         padded = points[np.minimum(np.arange(-(-len(points) // 3) * 3), len(points) - 1)]
@@ -150,7 +151,8 @@ def for_bullet(path: str, *, collision: bool) -> bytes | None:
     return _drawn(path, file_status(path))
 
 
-_CONTINUED = re.compile(rb"\\\r?\n")
+_MISREAD_OBJ = re.compile(rb"\\\r?\n|^[ \t]*[vf][^\n]*#", re.MULTILINE)
+"""Finds continued lines, and comments behind numbers."""
 
 
 @lru_cache(maxsize=128)

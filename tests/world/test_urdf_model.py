@@ -323,7 +323,7 @@ def test_a_damaged_visual_mesh_is_left_out_and_does_not_end_the_process(
 PYRAMID = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OBJ = {
     "indices that count back, in two parts": b"o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\no b\nv 0 0 1\nf -4 -3 -1\n",
-    "tabs": PYRAMID.replace(b" ", b"\t") + b"f\t1\t2\t3\nf\t1\t2\t4\n",
+    "tabs": PYRAMID.replace(b" ", b"\t") + b"f\t1\t2\t3\t# base\nf\t1\t2\t4\n",
     "continued lines": PYRAMID + b"f 1 2 \\\n3\nf 1 2 \\\r\n 4\n",
     "materials": b"mtllib a.mtl\nusemtl red\n" + PYRAMID + b"vt 0 0\nusemtl blue\nf 1/1 2/1 3/1\nf 1//1 2//1 4//1\n",
 }
