@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.events.codec import Heading
+from pycrorm_async.events.codec import Heading, short_name
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.events.types import (
     BriefPose,
@@ -350,7 +350,7 @@ class Recording:
             NodeStarted(
                 declared.declaration.kind,
                 parent,
-                declared.fingerprint,
+                short_name(declared.fingerprint),
                 {name: self._written(value, places) for name, value in node.values.items()},
                 _robot(node.robot),
             )

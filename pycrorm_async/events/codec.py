@@ -19,9 +19,9 @@ pure function of the old object, which it may modify and return.
 A new field whose default means the same as its absence did before does not change the shape and needs no upcaster.
 
 Some code reads fields by key, without the shape, so these keep their place in every version: `parameters` and
-`designator` of NodeStarted, `simulated` of EpisodeStarted, and all fields of DesignatorTypeDeclared that the view
-`designator_type` shows. The log stores only the bytes of a declaration, so a declaration of a version above 1 carries
-its version in them, under the key `version`.
+`designator` of NodeStarted (a fingerprint, from version 3 on its `short_name`), `simulated` of EpisodeStarted, and all
+fields of DesignatorTypeDeclared that the view `designator_type` shows. The log stores only the bytes of a declaration,
+so a declaration of a version above 1 carries its version in them, under the key `version`.
 """
 
 import hashlib
@@ -48,9 +48,11 @@ def unchanged(old: dict[str, Any]) -> dict[str, Any]:
 UPCASTERS: Final[dict[tuple[str, int], Upcaster]] = {
     # Version 2 omits frame and orientation of a pose where they are the default, in NodeStarted the robot's pose where
     # its object's row has it, and in NodeEnded the content of a failure where the end of another node has it.
-    **{(name, 1): unchanged for name in ("ObjectAdded", "ObjectMoved", "LocationResolved", "ObjectDetected")},
-    ("NodeStarted", 1): unchanged,
-    ("NodeEnded", 1): unchanged,
+    **{(name, 1): unchanged for name in "ObjectAdded ObjectMoved LocationResolved ObjectDetected".split()},
+    **{(name, 1): unchanged for name in ("NodeStarted", "NodeEnded")},
+    # Version 3 omits the kind of an action and the status SUCCEEDED, and shortens the fingerprint of a designator type.
+    ("NodeStarted", 2): lambda old: old | {"designator": short_name(old.get("designator") or "") or None},
+    ("NodeEnded", 2): unchanged,
 }
 """Upcasters by event type and old version."""
 
@@ -233,6 +235,11 @@ def fingerprint(declaration: bytes, type_name: str = "DesignatorTypeDeclared") -
     That of a description follows a prefix, by which the log distinguishes the two types.
     """
     return DECLARATION_TYPES[type_name] + hashlib.blake2b(declaration, digest_size=16).hexdigest()
+
+
+def short_name(fingerprint: str) -> str:
+    """Return the name that nodes have for the designator type with this fingerprint: its first 64 bits."""
+    return fingerprint[:16]
 
 
 def declaration_type(fingerprint: str) -> str:

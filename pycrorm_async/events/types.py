@@ -532,7 +532,8 @@ class NodeStarted(Happening, frozen=True):
     Attributes:
         kind: root, action, motion, language.
         parent: the parent's sequence; None for the root.
-        designator: fingerprint of the `DesignatorTypeDeclared`; None for the root, and if its class cannot be declared.
+        designator: the first digits of the fingerprint of the `DesignatorTypeDeclared` (`codec.short_name`); None for
+            the root, and if its class cannot be declared.
         parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
             poses as `PoseValue` or `PoseReference`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of
             these; a `MissingValue` for a value that cannot be recorded and for a field that the declaration omits.
@@ -541,9 +542,9 @@ class NodeStarted(Happening, frozen=True):
         continues: in a follow-up episode, the sequence that the continued node had in the former episode.
     """
 
-    version = 2
+    version = 3
 
-    kind: NodeKind
+    kind: NodeKind = "action"
     parent: int | None = None
     designator: str | None = None
     parameters: dict[str, Any] = {}
@@ -558,10 +559,10 @@ class NodeEnded(Happening, frozen=True):
     `untimed` is true if the time of the end is not known: that of the event says only when the end was reported.
     """
 
-    version = 2
+    version = 3
 
     node: int
-    status: NodeStatus
+    status: NodeStatus = "SUCCEEDED"
     failure: FailureValue | None = None
     result: Any = None
     untimed: bool = False

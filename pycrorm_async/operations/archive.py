@@ -17,6 +17,7 @@ from itertools import islice
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import DamageError
+from pycrorm_async.events.codec import fingerprint, short_name
 from pycrorm_async.events.types import BlobReference, references_in
 from pycrorm_async.operations.copy import declared_by
 from pycrorm_async.operations.removal import EVENTS_AT_ONCE, parts, remove
@@ -182,8 +183,9 @@ async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, 
     events = [event for _, some in episodes for event in some]
     lacking = lake.absent("declaration", "fingerprint", declared_by(events))
     declarations = await log.descriptions(lacking)
-    if lacking - declarations.keys():
-        declarations |= {name: each for name, each in (await log.named_declarations()).items() if name in lacking}
+    if types := lake.absent("declaration", "substr(fingerprint, 1, 16)", lacking - declarations.keys()):
+        declared = {fingerprint(each): each for each in await log.declarations()}
+        declarations |= {name: each for name, each in declared.items() if short_name(name) in types}
     references: dict[str, BlobReference] = {}
     referring = [(each.type, each.payload) for each in events if b'"$blob"' in each.payload]
     for kind, payload in [*referring, *(("DescriptionDeclared", each) for each in declarations.values())]:

@@ -18,7 +18,6 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
-from operator import attrgetter
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -34,7 +33,7 @@ from pycrorm_async.errors import (
     LogDamaged,
     UnknownEpisode,
 )
-from pycrorm_async.events.codec import Record, declaration_type, decode, encode, fingerprint
+from pycrorm_async.events.codec import Record, declaration_type, decode, encode, fingerprint, short_name
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
 from pycrorm_async.events.types import EVENT_TYPES, EpisodeTagged
@@ -361,7 +360,8 @@ class _Copier:
         described = [each for each in missing if declaration_type(each) == "DescriptionDeclared"]
         descriptions = await self._source.descriptions(described)
         if not missing - descriptions.keys() <= self._declared.keys():
-            self._declared = {fingerprint(payload): payload for payload in await self._source.declarations()}
+            declared = await self._source.declarations()
+            self._declared = {short_name(fingerprint(payload)): payload for payload in declared}
         sent = {name: payload for name, payload in self._declared.items() if name in missing} | descriptions
         self._sent |= sent.keys()
         return [Record(0, None, 0, declaration_type(name), 1, 0, 0, payload) for name, payload in sent.items()]
@@ -389,23 +389,22 @@ class _CopiedType(msgspec.Struct):
     description: str | None = None
 
 
-_DECLARED_BY = {"NodeStarted": attrgetter("designator"), "ObjectAdded": attrgetter("description")}
 _decode_declared = msgspec.json.Decoder(_CopiedType).decode
 
 
 def declared_by(events: Iterable[StoredEvent]) -> set[str]:
-    """Return the fingerprints of the types and descriptions that these events name.
+    """Return the short names of the types and the fingerprints of the descriptions that these events name.
 
     Leaves out one that another version stores elsewhere; the fold parks its node.
     """
     named: set[str | None] = set()
     for event in events:
-        if (name := _DECLARED_BY.get(event.type)) is not None:
-            try:
-                named.add(name(_decode_declared(event.payload)))
-            except msgspec.ValidationError:
-                continue
-    return {each for each in named if each is not None}
+        with suppress(msgspec.ValidationError):
+            if event.type == "NodeStarted":
+                named.add(short_name(_decode_declared(event.payload).designator or ""))
+            elif event.type == "ObjectAdded":
+                named.add(_decode_declared(event.payload).description)
+    return {each for each in named if each}
 
 
 # === tag ======================================================================================================

@@ -27,6 +27,8 @@ Storage: TypeAlias = Literal[
 ]
 """The storage of a column: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON,
 bytes, or the number of an episode or of an event, which 32 bits hold."""
+StoredName: TypeAlias = Callable[[str], str]
+"""Returns the name that a column of a layout has in a database."""
 
 OWN = "pycrorm_own_"
 """The prefix of the tables of custom projections, so that they never collide with the table of a designator."""
@@ -377,9 +379,12 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 # pose. Foreign keys are not enforced, because that would cost a third of the write rate; `verify` checks integrity.
 #
 # PostgreSQL partitions the tables by episode if the memory is placed so (`store.placement`). No row refers to a row of
-# another episode, views and relationships join by id and episode, and on PostgreSQL the episode is part of every
-# primary key, as a table partitioned by it requires. The id comes first in the key, so that a lookup by id alone, which
-# is unique in the memory, finds its row as well.
+# another episode, views and relationships join by id and episode, and the episode is part of the primary key of a
+# partitioned table, as PostgreSQL requires. The id comes first in the key, so that a lookup by id alone, which is
+# unique in the memory, finds its row as well.
+#
+# The rows of one event in `joint_change` and `state_sample` differ in a name, which each takes from another key of one
+# JSON object. An index that shows this again would repeat the names, so these tables have an index of the id instead.
 #
 # Three kinds of tables are not partitioned. `pycrorm_link_box` has the boxes of descriptions, each once by its content,
 # however many episodes use it: a catalogue, as the declarations are. The lists of episodes (`process_metadata`,
@@ -387,7 +392,9 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 # (`pycrorm_progress`). A row of `recall_block`, the index of the recall of all episodes, has cases of many of them, and
 # 0 as its episode: one partition has all of them.
 
-_TEXT_KEYS = ("field", "joint", "channel", "model")
+_NAMES_IN_EVENT = frozenset({"joint", "channel"})
+"""The parts of keys that are names of one event's values, and so are unique there."""
+_TEXT_KEYS = ("field", "model", *_NAMES_IN_EVENT)
 """The columns of keys that are texts; all others are integers."""
 
 _FURTHER = {("task_tree_node", "dtype"): ("status",), ("episode_tagging", "tag"): (EPISODE,)}
@@ -407,23 +414,25 @@ An index-only scan saves `PickUpWithContextView` reading a page for each node, h
 _WIDTHS: dict[Storage, int] = {"number": 4, "boolean": 1, "text": 0, "json": 0, "bytes": 0}
 """The bytes to which PostgreSQL aligns a column, 8 for the others. Columns in this order need no bytes in between."""
 
-_ORDER = "order"
+_ORDER, _PARTITIONED = "order", "partitioned"
 MARKED: Final = "marked"
 """The entry of a table's `info` that is True if its column `simulated` marks simulations, and is no field of a type."""
 
 
-def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> sa.Table:
+def make_table(
+    name: str, columns: dict[str, Storage], generation: int, stored: StoredName, *, partitioned: bool = False
+) -> sa.Table:
     """Return the table with its key and its indexes, in one generation.
 
-    `stored` maps a column of the layout to its name in this database; the table's column keys are those of the layout.
-    The latest tables are kept, because the views of all tables are made again whenever one is added.
+    The table's column keys are those of the layout. The latest tables are kept, because the views of all tables are
+    made again whenever one is added.
     """
-    return _make_table(name, tuple(columns.items()), generation, stored)
+    return _make_table(name, tuple(columns.items()), generation, stored, partitioned=partitioned)
 
 
 @lru_cache(maxsize=512)
 def _make_table(
-    name: str, items: tuple[tuple[str, Storage], ...], generation: int, stored: Callable[[str], str]
+    name: str, items: tuple[tuple[str, Storage], ...], generation: int, stored: StoredName, *, partitioned: bool
 ) -> sa.Table:
     columns = dict(items)
     table = sa.Table(
@@ -442,7 +451,9 @@ def _make_table(
         info={_ORDER: tuple(columns), MARKED: "simulated" in CORE.get(name, ())},
     )
     if keys := [table.c[column] for column, storage in columns.items() if storage == "key"]:
-        table.append_constraint(_Key(*keys))
+        table.append_constraint(_Key(*keys, info={_PARTITIONED: partitioned}))
+        if _NAMES_IN_EVENT.intersection(each.key for each in keys):
+            sa.Index(index_name(name, "id", generation), table.c.id)
     for column in indexed(name, columns):
         keys = [table.c[each] for each in (column, *_FURTHER.get((name, column), ()))]
         if (name, column) in _ONLY_ON_POSTGRESQL:
@@ -477,13 +488,17 @@ def columns_in_order(table: sa.Table) -> list[sa.Column[Any]]:
 
 
 class _Key(sa.PrimaryKeyConstraint):
-    """A primary key that on PostgreSQL also has the episode, behind the id. On SQLite a single key is the rowid."""
+    """A primary key that in a partitioned table also has the episode. On SQLite a single key is the rowid."""
 
 
-@compiles(_Key, "postgresql")
-def _with_episode(key: _Key, compiler: Any, **_options: Any) -> str:
+@compiles(_Key)
+def _compile_key(key: _Key, compiler: Any, **options: Any) -> str | None:
+    if _NAMES_IN_EVENT.intersection(key.columns.keys()):
+        return None
+    if compiler.dialect.name == "sqlite":
+        return str(compiler.visit_primary_key_constraint(key, **options))
     first, *others = key.columns
-    episode = [first.table.c[EPISODE]] if EPISODE in first.table.c else []
+    episode = [first.table.c[EPISODE]] if key.info[_PARTITIONED] and EPISODE in first.table.c else []
     columns = ", ".join(compiler.preparer.format_column(each) for each in (first, *episode, *others))
     # Rows are appended with ascending ids, so a page of the index needs no room, except for nodes that end later.
     filling = "" if "status" in first.table.c else " WITH (fillfactor = 100)"

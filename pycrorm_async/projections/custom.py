@@ -432,7 +432,7 @@ class ProjectedBatch(ABC):
 
     Args:
         projection: to fold with.
-        declared: designator types by fingerprint.
+        declared: designator types by their short names.
         folds: those of the episodes that earlier batches began.
 
     Attributes:

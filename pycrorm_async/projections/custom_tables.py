@@ -19,7 +19,7 @@ from sqlalchemy import Dialect
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.events.codec import declaration_of, fingerprint
+from pycrorm_async.events.codec import declaration_of, fingerprint, short_name
 from pycrorm_async.projections import pipeline as checkpoints
 from pycrorm_async.projections.columns import OWN, Layout, Storage, next_number
 from pycrorm_async.projections.custom import CustomRows, EpisodeFolds, PackedProjection, Projection, columns_of
@@ -56,7 +56,7 @@ def learner_of(projection: Projection) -> checkpoints.Learn:
         declared = {}
         for payload in payloads:
             try:
-                declared[fingerprint(payload)] = declaration_of(payload)
+                declared[short_name(fingerprint(payload))] = declaration_of(payload)
             except ValueError:  # from a newer version: its nodes cannot be folded
                 continue
         if isinstance(projection, PackedProjection):

@@ -21,7 +21,7 @@ resume, and a row under `gone` all that it needs to drop the tables.
 """
 
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -46,6 +46,7 @@ from pycrorm_async.projections.columns import (
     Layout,
     MaterialisedView,
     Storage,
+    StoredName,
     Union,
     columns_in_order,
     expected,
@@ -62,7 +63,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.placement import PLAIN, Placement
 
-PROJECTION_VERSION = 11
+PROJECTION_VERSION = 12
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"
@@ -89,9 +90,6 @@ INSERT INTO {_NOTES} (projection, version, generation, revision, layout, views)
 VALUES (:projection, :version, :generation, :revision, :layout, :views)
 ON CONFLICT (projection) DO UPDATE SET version = excluded.version, generation = excluded.generation,
  revision = excluded.revision, layout = excluded.layout, views = excluded.views""")  # noqa: S608
-_Stored: TypeAlias = Callable[[str], str]
-"""Maps a column to its name in a database."""
-
 _VIEWS_KEPT = 1_024
 """Bounds the views whose texts are kept for the next memory and the next type: the 75 of a new memory take 70 ms to
 write and 0.1 MB to keep."""
@@ -371,7 +369,7 @@ async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[s
 def table_texts(
     tables: Mapping[str, Mapping[str, Storage]],
     generation: int,
-    stored: _Stored,
+    stored: StoredName,
     dialect: sa.Dialect,
     placement: Placement = PLAIN,
 ) -> list[str]:
@@ -388,11 +386,11 @@ def _definitions(
     name: str,
     columns: tuple[tuple[str, Storage], ...],
     generation: int,
-    stored: _Stored,
+    stored: StoredName,
     syntax: _Syntax,
     placement: Placement,
 ) -> tuple[str, ...]:
-    table = make_table(name, dict(columns), generation, stored)
+    table = make_table(name, dict(columns), generation, stored, partitioned=placement.partitions > 0)
     indexes = sorted(
         (each for each in table.indexes if each.info.get("dialect", syntax.name) == syntax.name),
         key=lambda each: str(each.name),
@@ -450,9 +448,9 @@ class ViewRefused(DatabaseError):
 async def make_materialised(connection: AsyncConnection, kept: MaterialisedView, generation: int) -> None:
     """Create the two tables of a materialised view, empty."""
     stored = dialect_of(connection).stored_column
-    rows = make_table(kept.table, kept.columns, generation, stored)
-    create = str(CreateTable(rows).compile(dialect=connection.dialect)).rstrip()
     placement = await dialect_of(connection).placement(connection)
+    rows = make_table(kept.table, kept.columns, generation, stored, partitioned=placement.partitions > 0)
+    create = str(CreateTable(rows).compile(dialect=connection.dialect)).rstrip()
     await dialect_of(connection).execute_all(connection, placement.creation(create, rows.name, EPISODE))
     index = sa.Index(index_name(kept.table, EPISODE, generation), rows.c[EPISODE])
     await connection.execute(CreateIndex(index))
@@ -465,7 +463,7 @@ def materialised_tables(layout: Layout) -> list[str]:
     return [*present, *layout.outdated]
 
 
-def shown_texts(layout: Layout, generation: int, stored: Callable[[str], str]) -> dict[str, str]:
+def shown_texts(layout: Layout, generation: int, stored: StoredName) -> dict[str, str]:
     """Return name and public SQL of every user's view; that of a materialised view selects from its table."""
     texts = dict(layout.user_views)
     for name, kept in layout.kept.items():

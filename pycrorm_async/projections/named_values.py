@@ -9,7 +9,6 @@ needs none.
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-import msgspec
 from msgspec.structs import replace
 
 from pycrorm_async.events import types as event_types
@@ -21,39 +20,8 @@ from pycrorm_async.store.stored import Span, StoredEvent
 _NAMED: Final = frozenset({"ObjectAdded", "ObjectMoved", "NodeStarted"})
 """The types of the events that may be named; also NodeEnded, if it has a failure."""
 _FAILED: Final = b'"failure":'
-
-
-class _NamedRow(msgspec.Struct):
-    row: int
-
-
-class _Robot(msgspec.Struct):
-    object: _NamedRow | None = None
-    pose: Any = None
-
-
-class _Start(msgspec.Struct):
-    """The parts of a NodeStarted that name other events."""
-
-    robot: _Robot | None = None
-    parameters: dict[str, Any] = {}
-
-
-class _NamedEnd(msgspec.Struct):
-    end: int
-
-
-class _Failure(msgspec.Struct):
-    of: _NamedEnd | None = None
-
-
-class _End(msgspec.Struct):
-    """The part of a NodeEnded that names the end of another node."""
-
-    failure: _Failure | None = None
-
-
-_start, _end = msgspec.json.Decoder(_Start), msgspec.json.Decoder(_End)
+_NAMING: Final = {"NodeStarted": (b'"robot"', b'"pose_of"'), "NodeEnded": (_FAILED,)}
+"""The parts of payloads, by type of event, one of which is in each that names another event."""
 
 
 class NamedValues:
@@ -110,19 +78,19 @@ class NamedValues:
 
 def _named_by(event: StoredEvent) -> Iterator[int]:
     """Yield the sequences of the events that this one names."""
-    started, failure = _Start(), None
-    try:
-        if event.type == "NodeStarted" and (b'"robot"' in event.payload or b'"pose_of"' in event.payload):
-            started = _start.decode(event.payload)
-        elif event.type == "NodeEnded" and _FAILED in event.payload:
-            failure = _end.decode(event.payload).failure
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):  # the fold refuses the event
+    if not any(each in event.payload for each in _NAMING.get(event.type, ())):
         return
-    if failure is not None and failure.of is not None:
-        yield failure.of.end
-    robot = started.robot
-    if robot is not None and robot.pose is None and robot.object is not None:
-        yield robot.object.row
-    for value in started.parameters.values():
-        if (reference := event_types.PoseReference.of(value)) is not None:
-            yield reference.pose_of
+    try:
+        happening = happening_of(event)
+    except CannotFold:  # its own fold refuses it
+        return
+    if isinstance(happening, event_types.NodeEnded):
+        if happening.failure is not None and happening.failure.of is not None:
+            yield happening.failure.of.end
+    elif isinstance(happening, event_types.NodeStarted):
+        robot = happening.robot
+        if robot is not None and robot.pose is None and robot.object is not None:
+            yield robot.object.row
+        for value in happening.parameters.values():
+            if (reference := event_types.PoseReference.of(value)) is not None:
+                yield reference.pose_of

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple, Self, TypeAlias
 import msgspec
 
 from pycrorm_async.bulk_records import make
+from pycrorm_async.events.codec import short_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id, row_key
 from pycrorm_async.events.types import (
     BLOB_KEY,
@@ -333,9 +334,9 @@ class DesignatorFold:
 
 
 class Designators:
-    """The folds of all declared designator types, by the fingerprint of their declaration.
+    """The folds of all declared designator types, by their short names.
 
-    `refused` maps the declarations whose nodes cannot be folded to the reason.
+    `declarations` and `refused`, the reasons why nodes cannot be folded, are by fingerprint.
     """
 
     def __init__(
@@ -344,9 +345,9 @@ class Designators:
         refused: Mapping[str, str] | None = None,
         own_names: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
     ) -> None:
-        self._refused = dict(refused or {})
-        accepted = {name: each for name, each in (declarations or {}).items() if name not in self._refused}
-        self._folds = {name: DesignatorFold(each, own_names.get(name, {})) for name, each in accepted.items()}
+        self._refused = {short_name(name): reason for name, reason in (refused or {}).items()}
+        named = {short_name(name): (each, own_names.get(name, {})) for name, each in (declarations or {}).items()}
+        self._folds = {name: DesignatorFold(*each) for name, each in named.items() if name not in self._refused}
 
     @classmethod
     def of_union(cls, united: Union) -> Self:

@@ -148,7 +148,7 @@ class EpisodeReplay:
 
     Attributes:
         number, id: of the episode.
-        dtypes: the dtype of each designator type, by fingerprint; the reader of the log keeps it up to date.
+        dtypes: the dtype of each designator type, by its short name; the reader of the log keeps it up to date.
         begin_ns, begin_wall_ns: monotonic and wall time of the first event.
         at, wall_ns: the last event that was read, and its wall time; event 0 before.
         started: the first event; empty before it is read.

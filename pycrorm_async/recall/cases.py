@@ -395,7 +395,7 @@ READS: Final = (
 
 
 DeclarationOf: TypeAlias = Callable[[str], event_types.DesignatorTypeDeclared | None]
-"""Returns the designator type of a fingerprint; None if it was never declared, or by a newer version."""
+"""Returns the designator type that a node names; None if it was never declared, or by a newer version."""
 
 
 @dataclass(slots=True)
@@ -433,7 +433,7 @@ class EpisodeCases:
     """The cases of one episode, from its first event on.
 
     Args:
-        types: the feature fields by fingerprint, which the folds of several episodes share.
+        types: the feature fields by the short names of types, which the folds of several episodes share.
     """
 
     def __init__(self, types: dict[str, FeatureFields] | None = None) -> None:

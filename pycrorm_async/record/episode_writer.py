@@ -27,7 +27,7 @@ from msgspec.structs import replace
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, EpisodeFull, FilesError, SpoolFull, SpoolStuck, Unrecordable
 from pycrorm_async.events import types as event_types
-from pycrorm_async.events.codec import Heading, NotEncodable, encode, encoded_bytes
+from pycrorm_async.events.codec import Heading, NotEncodable, encode, encoded_bytes, short_name
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.reasons import UNNAMED
@@ -295,8 +295,9 @@ class NodeEvents:
         if missing:
             emitter.note_missing(owner, missing, may_refuse=may_refuse)
         written = cast("event_types.RobotValue", robot.written) if robot is not None else None
+        kind = "action" if kind == "action" else kind  # the encoder omits only the object that is the default
         event = event_types.NodeStarted(
-            kind, parent, declared.fingerprint or None, parameters, written, self._simulated
+            kind, parent, short_name(declared.fingerprint) or None, parameters, written, self._simulated
         )
         shown: dict[str, Any] = {}
         if emitter.feed.observers:
@@ -317,6 +318,7 @@ class NodeEvents:
         untimed: bool = False,
     ) -> None:
         """Write the end of a node; no effect if it has ended, as the garbage collector may cause meanwhile."""
+        status = "SUCCEEDED" if status == "SUCCEEDED" else status  # as the kind of a start
         self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
         try:
             owner = self._open.pop(node, None)
@@ -456,7 +458,7 @@ class Emitter:
             self.missing.note_renamed(own.dtype, "type", *declared.dtype)
         if own.payload:
             self.put_payload(Heading(None, kind.__name__, kind.version), own.payload)
-            self.feed.note_type(own.fingerprint, own.declaration)
+            self.feed.note_type(short_name(own.fingerprint), own.declaration)
 
     def put_blob(self, content: bytes, media_type: str) -> event_types.BlobReference:
         """Write a blob; return the reference for events put afterwards. Never waits.

@@ -60,18 +60,17 @@ class EventFeed:
         self._declarations: dict[str, DesignatorTypeDeclared] = {}
         self._change = threading.Lock()
 
-    def note_type(self, fingerprint: str, declaration: DesignatorTypeDeclared) -> None:
+    def note_type(self, designator: str, declaration: DesignatorTypeDeclared) -> None:
         """Remember a declared designator type, by whose name events of its nodes are published."""
-        self._declarations[fingerprint] = declaration
+        self._declarations[designator] = declaration
 
-    def declaration(self, fingerprint: str | None) -> DesignatorTypeDeclared | None:
-        """Return the designator type with this fingerprint, if this memory declared it."""
-        return self._declarations.get(fingerprint) if fingerprint is not None else None
+    def declaration(self, designator: str | None) -> DesignatorTypeDeclared | None:
+        """Return the designator type that a node names (`NodeStarted.designator`), if this memory declared it."""
+        return self._declarations.get(designator) if designator is not None else None
 
     def publish(self, episode: EpisodeId, sequence: int, happening: Happening) -> None:
         """Add an event to the buffer of each observer. Never waits."""
-        designator = happening.designator if isinstance(happening, NodeStarted) else None
-        declaration = self.declaration(designator)
+        declaration = self.declaration(happening.designator) if isinstance(happening, NodeStarted) else None
         dtype = declaration.dtype if declaration is not None else None
         event = RecordedEvent(episode_text(episode), sequence, happening, dtype)
         for each in self.observers:

@@ -26,7 +26,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, UnknownEpisode
-from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
+from pycrorm_async.events.codec import Record, declared_dtype, fingerprint, short_name
 from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, is_episode_id, number_in
 from pycrorm_async.settings import FILE_MODES, FileAccess
@@ -379,13 +379,9 @@ class EventLog:
             return await self._dialect.declarations(connection)
 
     async def dtypes(self) -> dict[str, str]:
-        """Read the dtypes of all declared designator types, by fingerprint, without those that cannot be read."""
-        dtypes = {fingerprint(each): declared_dtype(each) for each in await self.declarations()}
+        """Read the dtypes of all designator types that can be read, by their short names."""
+        dtypes = {short_name(fingerprint(each)): declared_dtype(each) for each in await self.declarations()}
         return {name: dtype for name, dtype in dtypes.items() if dtype is not None}
-
-    async def named_declarations(self) -> dict[str, bytes]:
-        """Read the payloads of all designator types, by fingerprint."""
-        return {fingerprint(each): each for each in await self.declarations()}
 
     async def descriptions(self, fingerprints: Collection[str]) -> dict[str, bytes]:
         """Read the payloads of these DescriptionDeclared, by fingerprint; those that are not stored are left out."""

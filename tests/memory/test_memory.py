@@ -26,7 +26,7 @@ from pycrorm_async.errors import (
     SpoolStuck,
     UnknownUrl,
 )
-from pycrorm_async.events.codec import Heading, encode, fingerprint
+from pycrorm_async.events.codec import Heading, encode, fingerprint, short_name
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import ProcessMetaData
@@ -255,7 +255,7 @@ async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tm
         queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), payload)
         with pytest.raises(EpisodeParked, match="cannot read the declaration of its type"):
             async with memory.episode(description="newer") as episode:
-                started = NodeStarted("action", 2, fingerprint(payload))
+                started = NodeStarted("action", 2, short_name(fingerprint(payload)))
                 queue.put_nowait(Heading(episode.id, "NodeStarted", 1), encode(started))
                 await memory.flush()
         await NoteActionPerformable("fine").perform()

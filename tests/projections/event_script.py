@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from pycrorm_async.events.codec import Record, encode, fingerprint
+from pycrorm_async.events.codec import Record, encode, fingerprint, short_name
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
@@ -67,8 +67,8 @@ SAYING = declared("SayingAction", "saying_action", field("text", "text", 2))
 
 
 def name_of(declaration: DesignatorTypeDeclared) -> str:
-    """The fingerprint that a NodeStarted event carries."""
-    return fingerprint(encode(declaration))
+    """The name of a designator type that a NodeStarted event carries."""
+    return short_name(fingerprint(encode(declaration)))
 
 
 class Script:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.codec import Record, encode, fingerprint
+from pycrorm_async.events.codec import Record, encode, fingerprint, short_name
 from pycrorm_async.events.fields import column_name, table_name
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
 from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeStarted, FieldDeclared, FieldType, NodeStarted
@@ -193,7 +193,7 @@ def payload_of(bad: DesignatorTypeDeclared | bytes) -> bytes:
 async def test_crafted_declarations_park_their_own_episodes_and_the_others_are_folded(log: EventLog) -> None:
     records: list[Record] = []
     for number, (bad, _) in enumerate(HOSTILE, 2):
-        records += [raw(payload_of(bad)), *performing(number, fingerprint(payload_of(bad)))]
+        records += [raw(payload_of(bad)), *performing(number, short_name(fingerprint(payload_of(bad))))]
     await stored_and_folded(log, [*records, *declarations(SAYING), *performing(1, SAYING, text="fine")])
     for _ in range(2):
         assert await ask(log, "SELECT text FROM saying_action") == [("fine",)]

@@ -313,7 +313,7 @@ def test_an_event_that_cannot_be_folded_names_the_reason_and_leaves_no_row(event
     ("type_", "payload", "version", "reason"),
     [
         ("RobotDanced", b"{}", 1, "RobotDanced is not an event type of this version"),
-        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 3, "NodeEnded has version 3, this version reads 2"),
+        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 4, "NodeEnded has version 4, this version reads 3"),
         ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
     ],
 )

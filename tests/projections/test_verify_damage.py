@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.events.codec import encode
+from pycrorm_async.events.codec import encode, fingerprint, short_name
 from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_each, ask_to_change
-from tests.projections.event_script import NAVIGATE, PICK_UP, name_of
+from tests.projections.event_script import NAVIGATE, PICK_UP
 from tests.projections.verify_cases import (
     PreparedMemory,
     assert_clean,
@@ -162,10 +162,10 @@ async def test_a_changed_value_in_a_payload_is_a_difference_of_the_tables(
 
 @pytest.mark.parametrize("name", ["zz\x1b", "{}0"])
 async def test_a_changed_name_of_a_declaration_is_reported(log: EventLog, database_url: str, name: str) -> None:
-    name = name.format(name_of(NAVIGATE))
+    name = name.format(fingerprint(encode(NAVIGATE)))
     ask_to_change(
         database_url,
-        f"UPDATE pycrorm_declaration SET fingerprint = '{name}' WHERE fingerprint = '{name_of(NAVIGATE)}'",
+        f"UPDATE pycrorm_declaration SET fingerprint = '{name}' WHERE fingerprint = '{fingerprint(encode(NAVIGATE))}'",
     )
     result = await verify(log)
     line = f"the declaration {name} does not match its fingerprint"
@@ -175,7 +175,7 @@ async def test_a_changed_name_of_a_declaration_is_reported(log: EventLog, databa
 async def test_swapped_or_changed_declarations_are_reported(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second = name_of(NAVIGATE), name_of(PICK_UP)
+    first, second = fingerprint(encode(NAVIGATE)), fingerprint(encode(PICK_UP))
     payloads = {first: encode(NAVIGATE).decode(), second: encode(PICK_UP).decode()}
     for name, other in ((first, second), (second, first)):
         change = f"UPDATE pycrorm_declaration SET payload = '{payloads[other]}' WHERE fingerprint = '{name}'"
@@ -187,7 +187,7 @@ async def test_swapped_or_changed_declarations_are_reported(
     assert result.drift == 0
     ask_to_change(database_url, f"UPDATE pycrorm_declaration SET payload = '?' WHERE fingerprint = '{first}'")
     result = await findings_for_any_parts(log, database_url, monkeypatch)
-    of_event = f"event 10: {CANNOT} the designator type {second} was never declared"
+    of_event = f"event 10: {CANNOT} the designator type {short_name(second)} was never declared"
     assert {f"episode {number}, {of_event}" for number in (1, 2, 3)} < {str(each) for each in result.damages}
     assert result.drift == 0
 

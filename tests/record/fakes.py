@@ -54,7 +54,7 @@ class ListSink:
     ) -> int:
         if heading.type == "NodeEnded":
             self.before_end()
-        if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:
+        if heading.type == "NodeStarted" and self.broken_starts and b'"root"' not in payload:
             self.broken_starts -= 1
             raise RuntimeError("the disk is on fire")
         if self.broken:
