@@ -44,7 +44,8 @@ def check_arguments(seed: object, **texts: object) -> None:
     for name, text in texts.items():
         if text is not None and not isinstance(text, str):
             raise CallerError(f"the {name} of an episode must be a str, not {text!r:.100}")
-    if seed is not None and not (isinstance(seed, int) and -(2**63) <= seed < 2**63):
+    # A bool is an int, but a reader of the event refuses it.
+    if seed is not None and (isinstance(seed, bool) or not (isinstance(seed, int) and -(2**63) <= seed < 2**63)):
         raise CallerError(f"the seed of an episode must be an int of at most 64 bits, not {seed!r:.100}")
 
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import logging
 import math
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -523,7 +522,7 @@ class Object:
         self.model = read_model(self.description_text)
         self.robot_description = robot
         self.color = color
-        self._mass_kg = mass_kg
+        self._mass_kg = None if mass_kg is None else float(mass_kg)  # of any type of number, and recorded
         self.chains = {}
         self.body = Body(name, self.model, engine, pose, color, base_link or "")
         if world.copy_of is None:
@@ -815,7 +814,7 @@ def _check_identity(name: object, object_type: object) -> None:
 
 def _check_mass(name: str, mass_kg: object) -> None:
     """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
-    if mass_kg is not None and not (isinstance(mass_kg, int | float) and 0 < mass_kg <= sys.float_info.max):
+    if mass_kg is not None and not 0 < _number(mass_kg) < math.inf:
         raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r:.100}")
 
 

@@ -168,6 +168,11 @@ class RobotDescription:
     Otherwise it comes from behind along the fingers as they are before: of an arm parked with the hand up, from below,
     through the table."""
 
+    def __post_init__(self) -> None:
+        for what, text in (("name", self.name), ("serial", self.serial or "")):
+            if not isinstance(text, str):
+                raise CallerError(f"the {what} of a robot must be a str, got {text!r}")
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PR2Description(RobotDescription):

@@ -27,6 +27,7 @@ from pycrorm_async.world import (
     Object,
     ObjectType,
     Pose,
+    RobotDescription,
     describe_arm,
     describe_robot,
 )
@@ -149,6 +150,31 @@ def test_a_position_of_any_type_of_number_becomes_a_float(world: BulletWorld, po
     arm = Object("arm", ObjectType.ROBOT, hinge())
     arm.set_joint_position("hinge", position)
     assert (type(arm.joint_position("hinge")), arm.joint_position("hinge")) == (float, float(position))
+
+
+@pytest.mark.parametrize("mass", [True, 2, np.float64(1.5), np.float32(0.5), Decimal("0.25")])
+async def test_a_mass_of_any_type_of_number_is_recorded(mass: float, tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        with BulletWorld():
+            async with memory.episode(description="weigh"):
+                Object("milk", ObjectType.MILK, mass_kg=mass)
+        await memory.flush()
+        then = await memory.as_of(1, time=1e9)
+        assert memory.status.missing.total == 0
+    assert then.world.objects[0].mass_kg == float(mass)
+
+
+@pytest.mark.parametrize("mass", ["1", b"1", 10**400, math.nan, 0, 1j])
+def test_a_mass_that_is_no_mass_is_refused(world: BulletWorld, mass: object) -> None:
+    with pytest.raises(ObjectRefused, match="the mass of object 'milk' must be a number of kg > 0"):
+        Object("milk", ObjectType.MILK, mass_kg=mass)  # type: ignore[arg-type]  # the error that is shown
+
+
+def test_the_name_and_the_serial_of_a_robot_are_texts() -> None:
+    with pytest.raises(CallerError, match="the name of a robot must be a str, got 3"):
+        RobotDescription(name=3)  # type: ignore[arg-type]  # the error that is shown
+    with pytest.raises(CallerError, match="the serial of a robot must be a str, got 17"):
+        RobotDescription(name="r", serial=17)  # type: ignore[arg-type]  # the error that is shown
 
 
 @pytest.mark.parametrize("color", [(1, 0, 0), "red", ("r", "e", "d", "!"), (math.nan, 0, 0, 1)])
