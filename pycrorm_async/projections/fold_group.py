@@ -35,7 +35,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
 _LOOK_S: Final = 1.0
-"""Interval between two looks at the group, 0.2 ms each, and so the time until the share of a dead process is taken."""
+"""Interval between two looks at the group, 0.4 ms each, and so the time until the share of a dead process is taken."""
 _STALL_S: Final = 10.0
 """The time after which a process that has not looked does not count: longer than a batch takes on a busy machine, and
 so short that a flush, which waits for 15 s, does not end before another process has folded what it waits for."""
