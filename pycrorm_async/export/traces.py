@@ -89,6 +89,7 @@ def trace_document(episode: TracedEpisode) -> dict[str, Any]:
         "begin_ns": episode.begin_wall_ns,
         "end_ns": episode.begin_wall_ns + episode.events[-1].since_ns,
         "status": episode.status,
+        "tags": list(episode.tags),
     }
     return {
         "displayTimeUnit": "ms",

@@ -518,6 +518,11 @@ def pose_at(position: Numbers, orientation: Numbers, at: int, frame: str = "map"
     return PoseValue((x, y, z), (qx, qy, qz, qw), frame, at)
 
 
+def tags_in(given: Any) -> list[str]:
+    """Return the texts of a list as tags, at most 100 characters of each; none for another value."""
+    return [each[:100] for each in given if isinstance(each, str) and each.strip()] if isinstance(given, list) else []
+
+
 def ns_of(moment: datetime) -> int:
     """Return a time of a map file; one without a zone is in UTC. Raises `CallerError`."""
     aware = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

@@ -357,8 +357,6 @@ class _NeemEpisode:
             begin = min(begin or first.at, first.at + self._shift_ns)
         begin = self._intake.in_range(begin)
         name = str(meta.get("_id") or "") or intakes.identity_of(*self._files.of("triples"), *self._tf)
-        keywords = given if isinstance(given := meta.get("keywords"), list) else ()
-        tags = [each[:100] for each in keywords if isinstance(each, str) and each.strip()]
         about = {key: each for key, each in meta.items() if key not in ("_id", "keywords", "created_by") and each}
         if self._shift_ns:
             about["tf_shift_s"] = self._shift_ns / 1e9
@@ -366,7 +364,7 @@ class _NeemEpisode:
             "/".join(filter(None, (name, vocabulary.local(own.iri)))),
             begin,
             description=str(meta.get("name") or meta.get("description") or f"NEEM {self._files.name}"),
-            tags=tags,
+            tags=intakes.tags_in(meta.get("keywords")),
             metadata={
                 "file": self._files.name,
                 **({"iri": own.iri} if own.iri else {}),

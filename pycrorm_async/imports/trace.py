@@ -198,6 +198,7 @@ def _read_events(path: Path, document: Mapping[str, Any], settings: TraceMap, in
         intakes.identity_of(path),
         _time(own.get("begin_ns")) or begin,
         description=str(own.get("description") or f"Trace {path.name}"),
+        tags=intakes.tags_in(own.get("tags")),
         metadata={"file": path.name, **({"names": sorted(reader.names)} if reader.names else {})},
     )
     with episode:
@@ -498,10 +499,11 @@ class _Trace:
         service = self.resources.get("service.name")
         described = self._description or " ".join(str(each) for each in (service, *tops[:1]) if each)
         metadata = {"file": path.name, "trace": trace_id, "resource": self.resources}
+        tags = intakes.tags_in(self.resources.get(f"{_OWN}tags"))
         # Another file may have other spans of the trace, which must not count as stored.
         digest = hashlib.sha256(" ".join(sorted(self.spans)).encode()).hexdigest()[:16]
         name = f"{trace_id}-{digest}"
-        episode = intake.episode(name, self.begin, description=described, metadata=metadata)
+        episode = intake.episode(name, self.begin, description=described, tags=tags, metadata=metadata)
         with episode:
             others = [(at, partial(_observation(name, values), episode)) for at, name, values in self._of_root]
             give_spans(episode, spans, others)

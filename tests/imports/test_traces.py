@@ -90,7 +90,7 @@ def recorded_values(url: str) -> None:
     with Memory.sync(url) as memory:
         given = {"i": int, "n": int, "r": float, "many": list[int], "by_name": dict[str, int]}
         count = memory.recording.type("action", "Count", given)
-        with memory.recording.episode(description="count", id="count", at=AT) as episode:
+        with memory.recording.episode(description="count", id="count", at=AT, tags=["a,b", "night"]) as episode:
             episode.observe("begun", {"load": -3}, at=AT + 1)
             for key, (number, real) in enumerate(((2**53 + 1, 0.5), (-(2**63), math.nan), (2**62 + 1, -0.0))):
                 values = {"i": number, "n": -5, "r": real, "many": [number, 1], "by_name": {"a": number}}
@@ -116,6 +116,7 @@ def test_whole_numbers_keep_each_digit_and_what_was_missing_stays_so(tmp_path: P
     assert first == {"i": big, "n": -5.0, "r": 0.5, "many": [big, 1], "by_name": {"a": big}}
     assert second == {"i": least, "n": -5.0, "many": [least, 1], "by_name": {"a": least}}
     assert (third["i"], math.copysign(1, third["r"])) == (2**62 + 1, -1.0)
+    assert ask(tmp_path / "memory.db", "SELECT tag FROM episode_tag ORDER BY tag") == [("a,b",), ("night",)]
     observed = "SELECT json_extract(payload, '$.name'), wall_ns FROM event WHERE type = 'Observed' ORDER BY sequence"
     assert ask(tmp_path / "memory.db", observed) == [("begun", AT + 1), ("ended", AT + 99)]
 
