@@ -17,11 +17,12 @@ from pycrorm_async.errors import CallerError, DatabaseUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import NodeStarted
-from pycrorm_async.operations.copy import CopySummary, copy_episodes
+from pycrorm_async.operations.copy import CopySummary, copy_episodes, declared_by
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.workers import WORKERS, forked
 from pycrorm_async.settings import Settings
+from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.writer.drain import Backoff
 from tests.crash.forked_processes import ForkedProcess
 from tests.databases import Server, ask, ask_to_change
@@ -61,6 +62,14 @@ def counts(done: CopySummary) -> list[tuple[int, int, int, int]]:
 
 def path_of(url: str) -> Path:
     return Path(url.removeprefix("sqlite:///"))
+
+
+def test_events_of_all_versions_name_a_type_by_the_same_digits_of_its_fingerprint() -> None:
+    whole, short = b'{"designator":"00112233445566778899aabbccddeeff"}', b'{"designator":"0011223344556677"}'
+    added = b'{"description":"urdf-00112233445566778899aabbccddeeff"}'
+    starts = [StoredEvent(1, 1, "NodeStarted", 3, 0, 0, payload) for payload in (whole, short, b"{}")]
+    events = [*starts, StoredEvent(1, 2, "ObjectAdded", 2, 0, 0, added)]
+    assert declared_by(events) == {"0011223344556677", "urdf-00112233445566778899aabbccddeeff"}
 
 
 # --- complete copies --------------------------------------------------------------------------------------------------

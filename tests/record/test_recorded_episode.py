@@ -231,6 +231,20 @@ def test_a_key_in_use_ends_its_first_node_lost_and_starts_the_second(tmp_path: P
     assert_verified(tmp_path)
 
 
+def test_the_kind_of_an_action_and_the_status_of_success_are_omitted_whichever_objects_say_them(tmp_path: Path) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        for kind, status in (("action", "SUCCEEDED"), ("motion", "FAILED")):
+            own, outcome = (cast("Any", "".join(list(each))) for each in (kind, status))  # not the package's constants
+            episode.start(kind, recording.type(own, f"{kind}_of_a_tree"))
+            episode.end(kind, outcome)
+
+    assert faults_of(tmp_path, write) == (0, None)
+    starts, ends = events(tmp_path, "NodeStarted")[1:], events(tmp_path, "NodeEnded")[:2]
+    assert [(each.get("kind"), len(each["designator"])) for each in starts] == [(None, 16), ("motion", 16)]
+    assert [each.get("status") for each in ends] == [None, "FAILED"]
+    assert_verified(tmp_path)
+
+
 def test_an_unknown_parent_is_counted_and_an_ended_one_is_kept(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         kind = recording.type("action", "Step")
