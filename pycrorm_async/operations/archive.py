@@ -6,12 +6,12 @@ the memory. Only then is the episode removed from the memory (`operations.remova
 the two leaves the episode in both, and the next archive finds it in the lake and removes it. One that is killed before
 the commit leaves files that the catalog does not know; an hour later the next archive or erasure deletes them.
 
-While some episodes are added to the lake and read back, those before them are removed from the memory. The lake works
-in a thread, so that the statements of the removal need not wait for it.
+Episodes go in groups, each with one file of events. While one group is added to the lake and read back, the next one is
+read from the memory, and the one before it is removed. The lake works in a thread, so that the others need not wait.
 """
 
 import asyncio
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime
 from itertools import islice
 from typing import Final, NamedTuple
@@ -30,8 +30,9 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, RemovedEpisode, RunningDigest, Span, StoredEvent
 from pycrorm_async.writer.drain import Backoff, retry
 
-_EVENTS_AT_ONCE: Final = 200_000
-"""Bounds the events of one file of the lake, unless an episode has more, and with them the memory that is used."""
+_EVENTS_AT_ONCE: Final = 120_000
+"""Bounds the events of one file of the lake, unless an episode has more, and with them the memory that is used: a file
+of Parquet is read in groups of 122,880 rows."""
 
 _COMMITTING: Final = Backoff(first_s=0.1, longest_s=5.0, attempts_max=12)
 """The backoff of commits to a lake to which other processes commit: a catalog in a file refuses one of two at once."""
@@ -73,18 +74,13 @@ async def archive_episodes(
                 end_ns = before.timestamp() * 1e9
                 rows = [each for each in await log.episodes() if _may_go(each, end_ns)]
                 rows = rows if only is None else [each for each in rows if each.number in only]
-                total, done = sum(each.head for each in rows), 0
-                removing = asyncio.create_task(_remove(log, lake, (), {}, reason, summary))
-                try:
+                archiving = _Archiving(log, lake, reason, summary, report_progress, sum(each.head for each in rows))
+                async with asyncio.TaskGroup() as tasks:
                     for some in parts(rows, _EVENTS_AT_ONCE):
-                        digests = await _add_and_compare(log, lake, some, summary)
-                        done += sum(each.head for each in some)
-                        report_progress(done, total)
-                        await removing
-                        removing = asyncio.create_task(_remove(log, lake, some, digests, reason, summary))
-                finally:
-                    await removing
+                        tasks.create_task(archiving.archive(some), name="pycrorm archive")
                 lake.clear_orphans()
+            except ExceptionGroup as errors:  # the others of the group were cancelled
+                raise errors.exceptions[0] from None
             finally:
                 await lake.close()
             if summary.removed and log.address.is_sqlite:
@@ -99,72 +95,107 @@ def _may_go(row: EpisodeRow, end_ns: float) -> bool:
     return ended and row.refused is None and row.parked is None and row.folded == row.head
 
 
-async def _add_and_compare(
-    log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], summary: ArchiveSummary
-) -> dict[str, str]:
-    """Add the events that the lake lacks and read all back; return the digests by id of the episodes that may go."""
-    added = await _add_missing(log, lake, rows, summary)
-    read = await asyncio.to_thread(lake.digests, [each.id for each in added])
-    for each in added:
-        if read.get(each.id) != each.digest:
-            summary.stayed[each.id] = "the lake holds other events of it than this memory"
-    return {name: digest for name, digest in read.items() if name not in summary.stayed}
+class _ReadEpisode(NamedTuple):
+    """An episode of the memory, as the lake should have it, and its events."""
+
+    row: EpisodeRow
+    archived: LakeEpisode
+    events: Sequence[StoredEvent]
 
 
-async def _remove(
-    log: EventLog,
-    lake: Lake,
-    rows: Sequence[EpisodeRow],
-    digests: Mapping[str, str],
-    reason: str,
-    summary: ArchiveSummary,
-) -> None:
-    """Remove those of these episodes that have one of these digests in the lake."""
-    numbered = {row.number: digests[row.id] for row in rows if row.id in digests}
-    for some in parts([each for each in rows if each.number in numbered], EVENTS_AT_ONCE):
-        summary.removed.extend(await remove(log, some, reason=reason, archived_in=lake.address, digests=numbered))
+class _Archiving:
+    """Archives groups of episodes: reads one, adds the one before it, and removes the one before that."""
 
+    def __init__(
+        self,
+        log: EventLog,
+        lake: Lake,
+        reason: str,
+        summary: ArchiveSummary,
+        report_progress: ProgressCallback,
+        events: int,
+    ) -> None:
+        self._log = log
+        self._lake = lake
+        self._reason = reason
+        self._summary = summary
+        self._report_progress = report_progress
+        self._done, self._events = 0, events
+        self._reading, self._adding, self._removing = asyncio.Lock(), asyncio.Lock(), asyncio.Lock()
+        self._in_memory = asyncio.Semaphore(2)
 
-async def _add_missing(
-    log: EventLog, lake: Lake, rows: Sequence[EpisodeRow], summary: ArchiveSummary
-) -> list[LakeEpisode]:
-    """Add the events that the lake lacks; return the episodes that it should have now, to be read back."""
-    there, erased = lake.episode_rows([each.id for each in rows]), lake.erased([each.id for each in rows])
-    kept = await log.last_digests(rows[0].number, rows[-1].number)
-    new: list[tuple[LakeEpisode, Sequence[StoredEvent]]] = []
-    read_events = await _events(log, rows)
-    elsewhere = {each.id: each.archived_in for each in await log.restored(each.id for each in rows)}
-    for row in rows:
-        if elsewhere.get(row.id, lake.address) != lake.address:
-            summary.stayed[row.id] = f"it was restored from {elsewhere[row.id]}, which has it still: archive it there"
-            continue
-        if row.id in erased:
-            why = erased[row.id]
-            summary.stayed[row.id] = f"it was erased from the lake on {why}: `pycrorm erase` removes it here too"
-            continue
-        try:
-            events = read_events.get(row.number, [])
-            if len(events) < row.head:  # raises for the one that is damaged or missing
-                events = [event async for page in log.pages(row) for event in page]
-            digest = digest_after(RunningDigest.at_start(row.identity), events)
-        except DamageError as damage:
-            summary.stayed[row.id] = str(damage)
-            continue
-        own = kept.get(row.number)
-        if own is not None and own.sequence == row.head and own.digest != digest:
-            summary.stayed[row.id] = "its events do not match its digest: run `pycrorm verify`"
-            continue
-        after = there[row.id].head if row.id in there else 0
-        assert row.ended_wall_ns is not None, "it has ended"
-        episode = LakeEpisode(row.id, row.head, row.started_wall_ns, row.ended_wall_ns, digest)
-        if after > row.head:
-            summary.stayed[row.id] = f"the lake holds {after} events of it, and this memory only {row.head}"
-        else:
-            new.append((episode, events[after:]))
-    lacking = [each for each in new if each[0].id not in there or there[each[0].id] != each[0]]
-    if lacking:
-        await _add(log, lake, lacking)
-    return [each for each, _ in new]
+    async def archive(self, rows: Sequence[EpisodeRow]) -> None:
+        """Move these episodes into the lake; calls wait for each other in their order."""
+        moved = await self._copied(rows)
+        async with self._removing:
+            digests = {row.number: digest for row, digest in moved}
+            for some in parts([row for row, _ in moved], EVENTS_AT_ONCE):
+                removed = await remove(
+                    self._log, some, reason=self._reason, archived_in=self._lake.address, digests=digests
+                )
+                self._summary.removed.extend(removed)
+        self._done += sum(each.head for each in rows)
+        self._report_progress(self._done, self._events)
+
+    async def _copied(self, rows: Sequence[EpisodeRow]) -> list[tuple[EpisodeRow, str]]:
+        """Copy these episodes into the lake; return those that may be removed, with the digests of their events."""
+        async with self._in_memory:
+            async with self._reading:
+                read = await self._read(rows)
+            async with self._adding:
+                return await self._add(read)
+
+    async def _read(self, rows: Sequence[EpisodeRow]) -> list[_ReadEpisode]:
+        """Read the events of these episodes, without those that are damaged or do not match their digest."""
+        log, stayed = self._log, self._summary.stayed
+        kept = await log.last_digests(rows[0].number, rows[-1].number)
+        events_by_number = await _events(log, rows)
+        read: list[_ReadEpisode] = []
+        for row in rows:
+            try:
+                events: Sequence[StoredEvent] = events_by_number.get(row.number, [])
+                if len(events) < row.head:  # raises for the one that is damaged or missing
+                    events = [event async for page in log.pages(row) for event in page]
+                digest = digest_after(RunningDigest.at_start(row.identity), events)
+            except DamageError as damage:
+                stayed[row.id] = str(damage)
+                continue
+            own = kept.get(row.number)
+            if own is not None and own.sequence == row.head and own.digest != digest:
+                stayed[row.id] = "its events do not match its digest: run `pycrorm verify`"
+                continue
+            assert row.ended_wall_ns is not None, "it has ended"
+            archived = LakeEpisode(row.id, row.head, row.started_wall_ns, row.ended_wall_ns, digest)
+            read.append(_ReadEpisode(row, archived, events))
+        return read
+
+    async def _add(self, episodes: Sequence[_ReadEpisode]) -> list[tuple[EpisodeRow, str]]:
+        """Add the events that the lake lacks, and read all back; return the episodes with equal digests."""
+        lake, stayed, ids = self._lake, self._summary.stayed, [each.row.id for each in episodes]
+        there = await asyncio.to_thread(lake.episode_rows, ids)
+        erased = await asyncio.to_thread(lake.erased, ids)
+        elsewhere = {each.id: each.archived_in for each in await self._log.restored(ids)}
+        new: list[_ReadEpisode] = []
+        for each in episodes:
+            name = each.row.id
+            after = there[name].head if name in there else 0
+            if elsewhere.get(name, lake.address) != lake.address:
+                stayed[name] = f"it was restored from {elsewhere[name]}, which has it still: archive it there"
+            elif name in erased:
+                why = erased[name]
+                stayed[name] = f"it was erased from the lake on {why}: `pycrorm erase` removes it here too"
+            elif after > each.row.head:
+                stayed[name] = f"the lake holds {after} events of it, and this memory only {each.row.head}"
+            else:
+                new.append(each._replace(events=each.events[after:]))
+        lacking = [(each.archived, each.events) for each in new if there.get(each.row.id) != each.archived]
+        if lacking:
+            await _add(self._log, lake, lacking)
+        read = await asyncio.to_thread(lake.digests, [each.row.id for each in new])
+        for each in new:
+            if read.get(each.row.id) != each.archived.digest:
+                stayed[each.row.id] = "the lake holds other events of it than this memory"
+        return [(each.row, read[each.row.id]) for each in new if each.row.id not in stayed]
 
 
 async def _events(log: EventLog, rows: Sequence[EpisodeRow]) -> dict[int, list[StoredEvent]]:
@@ -181,7 +212,7 @@ async def _events(log: EventLog, rows: Sequence[EpisodeRow]) -> dict[int, list[S
 
 async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]]) -> None:
     events = [event for _, some in episodes for event in some]
-    lacking = lake.absent("declaration", "fingerprint", declared_by(events))
+    lacking = await asyncio.to_thread(lake.absent, "declaration", "fingerprint", declared_by(events))
     declarations = await log.descriptions(lacking)
     if types := lake.absent("declaration", "substr(fingerprint, 1, 16)", lacking - declarations.keys()):
         declared = {fingerprint(each): each for each in await log.declarations()}
@@ -191,7 +222,7 @@ async def _add(log: EventLog, lake: Lake, episodes: Sequence[tuple[LakeEpisode, 
     for kind, payload in [*referring, *(("DescriptionDeclared", each) for each in declarations.values())]:
         references |= {each.hash: each for each in references_in(kind, payload)}
     blobs: dict[str, tuple[str, bytes]] = {}
-    for name in lake.absent("blob", "hash", references):
+    for name in await asyncio.to_thread(lake.absent, "blob", "hash", references):
         content = await log.blobs.read_blob(name)
         if content is not None:
             blobs[name] = references[name].media_type, content

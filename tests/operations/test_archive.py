@@ -10,23 +10,26 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pycrorm_async import Memory, Reading, read_archived
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.operations import archive
 from pycrorm_async.operations.archive import ArchiveSummary, archive_episodes
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.removal import erasable, erase
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.lake import Lake, erase_in_lake, open_lake, query_lake
+from pycrorm_async.store.lake import Lake, LakeEpisode, erase_in_lake, open_lake, query_lake
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import EpisodeRow
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from tests.commands import pycrorm
 from tests.crash.forked_processes import ForkedProcess, die_at_statement
 from tests.databases import ask, put_memory
@@ -105,7 +108,11 @@ async def test_several_memories_archive_into_one_lake_and_what_arrives_of_an_arc
 
 
 def archive_until(url: str, lake: str, last: int) -> None:
-    """Archive, and die before statement number `last` of the memory; with 0 to the end, and print their count."""
+    """Archive, and die before statement number `last` of the memory; with 0 to the end, and print their count.
+
+    Each episode is a group of its own, so that several are read, added and removed at once.
+    """
+    archive._EVENTS_AT_ONCE = 1  # type: ignore[misc]  # final, but for this process
     print_count = die_at_statement(last)
     asyncio.run(archived(url, lake))
     print_count()
@@ -132,6 +139,33 @@ async def test_an_archive_that_is_killed_at_any_step_is_finished_by_the_next(dat
                 assert [(*some[1:6], some[6].decode()) for some in events] == logs[each]
         finally:
             await source.close()
+
+
+async def test_an_archive_that_fails_keeps_what_it_has_moved_and_the_next_one_moves_the_rest(
+    tmp_path: Path, lake: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = put_memory(tmp_path / "memory.db")
+    ids = await recorded(url, "first", "second", "third", "fourth")
+    monkeypatch.setattr(archive, "_EVENTS_AT_ONCE", 1)
+    add, summary = Lake.add, ArchiveSummary([], {})
+
+    def fail_at_last(self: Lake, episodes: Sequence[tuple[LakeEpisode, Sequence[StoredEvent]]], *others: Any) -> None:
+        if episodes[0][0].id == ids[-1]:
+            raise CallerError("the disk of the lake is full")
+        add(self, episodes, *others)
+
+    monkeypatch.setattr(Lake, "add", fail_at_last)
+    with pytest.raises(CallerError, match="the disk of the lake is full"):  # one error, not a group
+        await archive_episodes(url, lake, before=LATER, reason="old", summary=summary)
+    moved = {each.id for each in summary.removed}
+    assert moved < {*ids}
+    assert logs_of(url).keys() == {*ids} - moved
+    await assert_clean(url)
+    monkeypatch.undo()
+    assert (await archived(url, lake)).stayed == {}
+    assert logs_of(url) == {}
+    rows = query_lake(lake, "SELECT DISTINCT episode::VARCHAR FROM event ORDER BY 1")[1]
+    assert rows == [(each,) for each in sorted(ids)]
 
 
 async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp_path: Path, lake: str) -> None:
