@@ -7,8 +7,8 @@
 Pick-up rollouts (`bench.material.rollouts`), ten in an episode, some 20 events each, are recorded and folded. Then the
 command archives all episodes and the next restores and folds them, in turns with those of `--python`, if it is named.
 Each size is repeated `--turns` times, and the turn with the least CPU time counts. A command's CPU time is that of its
-process with all threads, without a PostgreSQL server, and includes its start. The script prints one JSON line:
-by database, Python, size and command events a second of CPU time and of wall time, and the MB of the process.
+process with all threads and fold workers, without a PostgreSQL server, and includes its start. The script prints one
+JSON line: by database, Python, size and command, events a second of CPU time and of wall time, and MB of the process.
 """
 
 from __future__ import annotations

@@ -422,7 +422,7 @@ async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_
     source, target = new_file(), new_url()
     script = Script(1)
     script.put_payload("HandShaken", b'{"whom": "Ada", "firm": 1.50}')
-    script.put_payload("NodeStarted", b'{"designator": ["of", "another", "shape"]}', 3)
+    script.put_payload("NodeStarted", b'{"designator": ["of", "another", "shape"]}', NodeStarted.version + 1)
     await append_and_fold(source, script.records)
     (done,) = (await copy_episodes(source, target)).episodes
     assert done.damage is None
