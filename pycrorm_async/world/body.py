@@ -12,7 +12,7 @@ joint above the base moves the base, and the root keeps its pose.
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -180,6 +180,48 @@ def inner_points(body: Body) -> list[list[float]]:
             inner = np.concatenate([solid.inner_points for solid in solids])
             points += (inner @ rotation_matrix(turn).T + np.array(position)).tolist()
     return points
+
+
+# === arguments ================================================================================================
+
+
+def check_arguments(name: object, object_type: object, mass_kg: object, color: Iterable[Any] | None) -> None:
+    """Raise `ObjectRefused` for an argument of an object that is none."""
+    _check_identity(name, object_type)
+    _check_mass(name, mass_kg)
+    _check_color(name, color)
+
+
+def _check_identity(name: object, object_type: object) -> None:
+    """Raise `ObjectRefused` unless both have the right type; every record of an object holds them."""
+    if not isinstance(name, str):
+        raise poses.ObjectRefused(f"an object's name must be a str, got {name!r}")
+    if not isinstance(object_type, poses.ObjectType):
+        raise poses.ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
+
+
+def _check_mass(name: object, mass_kg: object) -> None:
+    """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
+    if mass_kg is not None and not 0 < number_or_nan(mass_kg) < math.inf:
+        raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r:.100}")
+
+
+def _check_color(name: object, color: Iterable[Any] | None) -> None:
+    """Raise `ObjectRefused` unless the color is None or four numbers; an engine would ignore another."""
+    try:
+        is_color = color is None or len([float(each) for each in color]) == 4
+    except (TypeError, ValueError, OverflowError):
+        is_color = False
+    if not is_color:
+        raise poses.ObjectRefused(f"the color of object {name!r} must be four numbers from 0 to 1, got {color!r:.100}")
+
+
+def number_or_nan(value: object) -> float:
+    """Return a number as a float, and NaN for what is none or has no float, which every check of a range refuses."""
+    try:
+        return math.nan if isinstance(value, str | bytes) else float(value)  # type: ignore[arg-type]  # raises TypeError
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 # === state ====================================================================================================

@@ -26,7 +26,16 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 from pycrorm_async import connected_var
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world import pose as poses
-from pycrorm_async.world.body import Body, ObjectState, WorldState, check_state, inner_points, set_state
+from pycrorm_async.world.body import (
+    Body,
+    ObjectState,
+    WorldState,
+    check_arguments,
+    check_state,
+    inner_points,
+    number_or_nan,
+    set_state,
+)
 from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.engines import Color, Engine, engine_class
 from pycrorm_async.world.model_boxes import shape_boxes
@@ -488,9 +497,7 @@ class Object:
         base_link: str | None = None,
         packages: Mapping[str, str | Path] = MappingProxyType({}),
     ) -> None:
-        _check_identity(name, object_type)
-        _check_mass(name, mass_kg)
-        _check_color(name, color)
+        check_arguments(name, object_type, mass_kg, color)
         world = world if world is not None else current_world.get()
         if world is None:
             raise poses.NoWorld(f"object {name!r}")
@@ -696,7 +703,7 @@ class Object:
             UnknownJoint, WorldClosed, ObjectNotInWorld.
         """
         self.check_present()
-        targets = {joint: _number(position) for joint, position in positions.items()}
+        targets = {joint: number_or_nan(position) for joint, position in positions.items()}
         for joint, position in targets.items():
             lower, upper = self.joint_limits(joint)
             leader = self.body.leader(joint)
@@ -802,34 +809,6 @@ class Object:
         if link not in self.body.movable_above:
             raise poses.UnknownLink(self.name, link, self.links)
         return link
-
-
-def _check_identity(name: object, object_type: object) -> None:
-    """Raise `ObjectRefused` unless both have the right type; every record of an object holds them."""
-    if not isinstance(name, str):
-        raise poses.ObjectRefused(f"an object's name must be a str, got {name!r}")
-    if not isinstance(object_type, poses.ObjectType):
-        raise poses.ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
-
-
-def _check_mass(name: str, mass_kg: object) -> None:
-    """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
-    if mass_kg is not None and not 0 < _number(mass_kg) < math.inf:
-        raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r:.100}")
-
-
-def _check_color(name: str, color: Sequence[object] | None) -> None:
-    """Raise `ObjectRefused` unless the color is None or four finite numbers; an engine would ignore another."""
-    if color is not None and not (len(color) == 4 and all(math.isfinite(_number(each)) for each in color)):
-        raise poses.ObjectRefused(f"the color of object {name!r} must be four numbers from 0 to 1, got {color!r:.100}")
-
-
-def _number(value: object) -> float:
-    """Return a number as a float, and NaN for what is none or has no float, which every check of a range refuses."""
-    try:
-        return math.nan if isinstance(value, str | bytes) else float(value)  # type: ignore[arg-type]  # raises TypeError
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
 
 
 def _check_pose(name: str, pose: poses.Pose) -> poses.Pose:

@@ -177,7 +177,7 @@ def test_the_name_and_the_serial_of_a_robot_are_texts() -> None:
         RobotDescription(name="r", serial=17)  # type: ignore[arg-type]  # the error that is shown
 
 
-@pytest.mark.parametrize("color", [(1, 0, 0), "red", ("r", "e", "d", "!"), (math.nan, 0, 0, 1)])
+@pytest.mark.parametrize("color", [(1, 0, 0), "red", ("r", "e", "d", "!"), (1, 0, 0, None)])
 def test_a_color_that_is_not_four_numbers_is_refused(world: BulletWorld, color: object) -> None:
     with pytest.raises(ObjectRefused, match="the color of object 'milk' must be four numbers"):
         Object("milk", ObjectType.MILK, color=color)  # type: ignore[arg-type]  # the error that is shown
