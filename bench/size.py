@@ -5,11 +5,11 @@
 
 Both sides store one tree of pick-up rollouts (`bench/material`) with the same values: the thesis' memory as rows of its
 tables, this one as events in the log and as the rows that are folded from them. In a SQLite file the pages of each
-table and index are counted (`dbstat`), on PostgreSQL the blocks (`pg_relation_size`). The tables of an empty memory are
-subtracted. A second memory of ours is that of `pycrorm learn`, in which the world, the joints and the failures of a
-robot are recorded, too. The script prints one JSON line: for each database and side bytes a node, for ours also by log
-and tables, rows and indexes apart, for each table and index that takes at least one byte a node, and the bytes of the
-payloads by type of event.
+table and index are counted (`dbstat`), on PostgreSQL the blocks (`pg_relation_size`), with those of long values
+(TOAST). The tables of an empty memory are subtracted. A second memory of ours is that of `pycrorm learn`, in which the
+world, the joints and the failures of a robot are recorded, too. The script prints one JSON line: for each database and
+side bytes a node, for ours also by log and tables, rows and indexes apart, for each table and index that takes at least
+one byte a node, and the bytes of the payloads by type of event.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ from tests.databases import ask, server_in
 _SEED = 69
 _PAGES = "SELECT name, sum(pgsize) FROM dbstat GROUP BY name"
 _BLOCKS = """
-SELECT relname, pg_relation_size(pg_class.oid) FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
-WHERE relkind IN ('r', 'i', 't') AND nspname NOT IN ('pg_catalog', 'information_schema', 'pg_toast')"""
+SELECT relname, pg_relation_size(pg_class.oid) + coalesce(pg_relation_size(nullif(reltoastrelid, 0)), 0)
+FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+WHERE relkind IN ('r', 'i') AND nspname NOT IN ('pg_catalog', 'information_schema', 'pg_toast')"""
 _LOG = re.compile(r"(sqlite_autoindex_)?(event|episode)(_|$)")
 _INDEX = re.compile(r"_by_|_pkey$|_key$|^sqlite_autoindex_")
 

@@ -191,7 +191,7 @@ async def test_a_crafted_episode_is_stopped_and_the_one_beside_it_is_in_the_tabl
 ) -> None:
     author = FolderWriter(spool, settings=QUICKLY_SYNCED)
     author.put(started(1), encode(EpisodeStarted("nonsense", "me", "host", "1.0", "3.11")))
-    author.put(node(1), b'{"node":99999999999999999999999}')
+    author.put(node(1), b'{"parent":99999999999999999999999}')
     author.put(started(2), encode(EpisodeStarted("sound", "me", "host", "1.0", "3.11")))
     author.sync()
     report = await recover(database_url, spool=spool)
