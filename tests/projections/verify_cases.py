@@ -288,6 +288,9 @@ def visible_tables(url: str) -> list[VisibleTable]:
         table.kinds[column] = kind.lower()
         if is_key:
             table.key.append(column)
+    for table in tables.values():
+        if not table.key:  # the rows of one event differ in a name
+            table.key.extend(each for each in table.columns if each in ("id", "joint", "channel"))
     return list(tables.values())
 
 
