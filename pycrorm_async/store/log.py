@@ -306,9 +306,12 @@ class EventLog:
         async with self.reading() as connection:
             if not (await self._dialect.table_state(connection, schema.DIGEST)).readable:
                 return {}
-            rows = await self._dialect.rows(
-                connection, storeds.DigestRow, schema.SELECT_LAST_DIGESTS, first=first, last=last
-            )
+            if first == last:
+                rows = await self._dialect.rows(connection, storeds.DigestRow, schema.SELECT_LAST_DIGEST, first=first)
+            else:
+                rows = await self._dialect.rows(
+                    connection, storeds.DigestRow, schema.SELECT_LAST_DIGESTS, first=first, last=last
+                )
         return {each.number: each for each in rows}
 
     async def removed(self, episodes: Collection[EpisodeId]) -> dict[EpisodeId, storeds.RemovedEpisode]:

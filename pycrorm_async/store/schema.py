@@ -376,6 +376,9 @@ SELECT_LAST_DIGESTS: Final = (
     .join(_last, sql.and_(DIGEST.c.episode == _last.c.episode, DIGEST.c.sequence == _last.c.sequence))
     .where(_of_range)
 )
+SELECT_LAST_DIGEST: Final = (  # reads one partition
+    select(DIGEST).where(DIGEST.c.episode == bindparam("first")).order_by(DIGEST.c.sequence.desc()).limit(1)
+)
 
 SELECT_REMOVED: Final = select(REMOVED).where(REMOVED.c.restored_wall_ns.is_(None)).order_by(REMOVED.c.number)
 SELECT_REMOVED_BY_ID: Final = SELECT_REMOVED.where(_is_among(REMOVED.c.id, "ids"))

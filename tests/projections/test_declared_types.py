@@ -313,23 +313,27 @@ def bytes_of(*types: DesignatorTypeDeclared) -> list[bytes]:
     return [encode(each) for each in types]
 
 
+def fingerprint_of(type_: DesignatorTypeDeclared) -> str:
+    return fingerprint(encode(type_))
+
+
 def test_a_field_added_later_joins_the_earlier_ones() -> None:
     united = unite(Layout(), bytes_of(TEXT, ENUM))
     assert united.layout.leaves == {"note_action": {"text": "text", "weight": "real"}}
-    assert united[1:] == ({name_of(TEXT): TEXT, name_of(ENUM): ENUM}, {}, {})
+    assert united[1:] == ({fingerprint_of(TEXT): TEXT, fingerprint_of(ENUM): ENUM}, {}, {})
 
 
 def test_a_field_of_another_type_is_kept_under_its_type_and_the_others_under_their_names() -> None:
     united = unite(Layout(), bytes_of(TEXT, NUMBER))
     assert united.layout.leaves == {"note_action": {"text": "text", "text_integer": "integer", "weight": "real"}}
     assert united.refused == {}
-    kept = united.accepted[name_of(NUMBER)]
+    kept = united.accepted[fingerprint_of(NUMBER)]
     assert [(each.name, each.column, each.slot) for each in kept.fields] == [
         ("text_integer", "text_integer", 2),
         ("weight", "weight", 3),
     ]
     line = "NoteAction.text is declared as text and as integer; the integer is kept as text_integer"
-    assert united.adjustments == {name_of(NUMBER): Adjustment({"text_integer": "text"}, [line])}
+    assert united.adjustments == {fingerprint_of(NUMBER): Adjustment({"text_integer": "text"}, [line])}
 
 
 POSE = declared("NoteAction", "note_action", field("about", "pose", 2), field("text", "real", 3))
@@ -352,7 +356,7 @@ def test_one_by_one_in_any_order_makes_the_tables_of_all_at_once(seed: int) -> N
         assert united[:3] == (layout, one_by_one.accepted, {})
         names = {name: each.own_names for name, each in united.adjustments.items()}
         assert names == {name: each.own_names for name, each in one_by_one.adjustments.items()}
-    assert set(one_by_one.accepted) == {name_of(each) for each in EVERY}
+    assert set(one_by_one.accepted) == {fingerprint_of(each) for each in EVERY}
 
 
 @pytest.mark.parametrize(
@@ -413,4 +417,4 @@ def test_the_later_declaration_gets_other_names(
 ) -> None:
     united = unite(Layout(), bytes_of(*types))
     assert united.layout.leaves == leaves
-    assert united.adjustments[name_of(types[-1])].lines == [line]
+    assert united.adjustments[fingerprint_of(types[-1])].lines == [line]

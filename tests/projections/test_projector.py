@@ -116,7 +116,7 @@ async def test_batches_of_any_size_make_the_same_rows(log: EventLog, batch_event
     ("bad", "reason"),
     [
         ("undeclared", "event 3: the designator type 00000000000000000000000000000000 was never declared"),
-        ("newer", "event 3: NodeEnded has version 3, this version reads 2"),
+        ("newer", "event 3: NodeEnded has version 4, this version reads 3"),
         (
             "taken",
             "event 3: SayingAction: its table would be 'pose', which the memory itself uses (set another dtype)",
@@ -139,7 +139,7 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_c
         case "undeclared":
             first.put(NodeStarted("action", 2, "0" * 32))
         case "newer":
-            first.put(NodeEnded(2, "SUCCEEDED"), version=3)
+            first.put(NodeEnded(2, "SUCCEEDED"), version=4)
         case "taken":
             first.put(NodeStarted("action", 2, name_of(taken), {"text": "hi"}))
         case _:

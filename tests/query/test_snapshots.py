@@ -377,7 +377,7 @@ UNREADABLE: list[tuple[str, bytes | None, int, type[Exception], str]] = [
     ("EpisodeStarted", None, 1, LogDamaged, "event 16: the episode starts a second time"),
     ("ObjectRemoved", b'{"object":{"object":5,"row":5}}', 1, LogDamaged, "event 16: object 5 was never added"),
     ("NodeStarted", b'{"kind":"action","parent":2,"designator":"0f"}', 1, LogDamaged, "type 0f was never declared"),
-    ("NodeEnded", b"{}", 3, DatabaseForeign, "event 16: NodeEnded has version 3, this version reads 2: use a newer"),
+    ("NodeEnded", b"{}", 4, DatabaseForeign, "event 16: NodeEnded has version 4, this version reads 3: use a newer"),
     ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event type of this version: use a newer"),
 ]
 
