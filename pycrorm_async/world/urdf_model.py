@@ -309,7 +309,7 @@ def _ros_packages(package: str) -> Iterator[Path]:
         for depth in ("*", "*/*"):  # a workspace with repositories of several packages
             yield from (each.parent for each in place.glob(f"{depth}/{package}/package.xml"))
         for depth in ("*", "*/*", "*/*/*"):  # a folder may have another name than its package
-            yield from (each for each in place.glob(depth) if _is_package(each, package))
+            yield from (each.parent for each in place.glob(f"{depth}/package.xml") if _is_package(each.parent, package))
 
 
 def _is_package(folder: Path, name: str) -> bool:
