@@ -612,7 +612,7 @@ def _table(place: str) -> TableClause:
 # only episodes with an event behind the mark have to be checked. The mark stays true: checkpoints never go back, a
 # parked episode stays so, and a rebuild begins a table without a mark. Only a removal takes checkpoints away, of an
 # episode that may be restored, and it raises the revision of each generation. So the mark belongs to one revision. It
-# names the event and not its rowid, because a rowid may be given again, and may change when the file is written anew.
+# names the event and not its rowid, because SQLite may give a rowid to a second event, and changes rowids in a VACUUM.
 # `mark` moves it only where many events are behind it, because that takes a transaction.
 #
 # `SideTarget` reads the generation under its key in every transaction. For a rebuild another number is an error. For a
