@@ -57,8 +57,7 @@ from pycrorm_async.world.pose import UnknownLink, yaw_quaternion
 from tests.plan.conftest import Scene
 from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
-from tests.world.fakes import CRANE, ChangeLog, Matrix, Z, matrix, shifted, turned
-from tests.world.loaded_model import bullet_frame
+from tests.world.fakes import CRANE, ChangeLog, Matrix, Z, bullet_frame, matrix, shifted, turned
 
 # === doors ====================================================================================================
 #

@@ -49,8 +49,7 @@ from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
-from tests.world.fakes import CRANE, ChangeLog, Matrix, X, Y, Z, matrix, shifted, turned
-from tests.world.loaded_model import bullet_frame
+from tests.world.fakes import CRANE, ChangeLog, Matrix, X, Y, Z, bullet_frame, matrix, shifted, turned
 
 # === manipulation =============================================================================================
 #

@@ -35,7 +35,7 @@ from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
-from tests.world.loaded_model import bullet_frame
+from tests.world.fakes import bullet_frame
 
 DetectionNote = tuple[str, ObjectType | None, tuple[Seen, ...], TaskTreeNode | None]
 

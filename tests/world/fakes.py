@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 
 from pycrorm_async.world import COURIER, Object, Pose, RobotDescription
 from pycrorm_async.world.models import built_in_model
+from pycrorm_async.world.pose import Arms, Quaternion, product
+from pycrorm_async.world.urdf import PR2, Limits
+from tests import bullet
 
 Matrix = NDArray[np.float64]
 
@@ -139,3 +143,43 @@ def rail_robot() -> RobotDescription:
 def link_poses(robot: Object) -> dict[str, Pose]:
     """Return the pose of every link."""
     return {each: robot.link_pose(each) for each in robot.links}
+
+
+# === arms =====================================================================================================
+
+
+def random_arm(rng: random.Random, arm: Arms, limits: Limits) -> dict[str, float]:
+    """Return joint angles drawn uniformly within the limits."""
+    bounds = PR2.arms[arm].limits(limits)
+    return {
+        name: rng.uniform(max(bounds[name].lower, -3.14), min(bounds[name].upper, 3.14))
+        if "forearm_roll" in name or "wrist_roll" in name
+        else rng.uniform(*bounds[name])
+        for name in PR2.arms[arm].joints
+    }
+
+
+def random_base_pose(rng: random.Random) -> tuple[Pose, float]:
+    """Return a base pose, not only upright, and a torso height."""
+    turn = [rng.gauss(0, 1) for _ in range(4)]
+    return Pose([rng.uniform(-3, 3) for _ in range(3)], turn), rng.uniform(0.0, 0.33)
+
+
+def angle_between(a: Quaternion, b: Quaternion) -> float:
+    """Return the angle in rad; it is exact also for small angles."""
+    x, y, z, _ = product((-a.x, -a.y, -a.z, a.w), b)
+    return 2 * math.hypot(x, y, z)
+
+
+def bullet_frame(target: Object, link: str) -> Matrix:
+    """Return the link's frame in the map by Bullet's own forward kinematics, in single precision."""
+    number, client = target.body.number, bullet.client_of(target.world)
+    names = [
+        bullet.getJointInfo(number, joint, physicsClientId=client)[12].decode()
+        for joint in range(bullet.getNumJoints(number, physicsClientId=client))
+    ]
+    state = bullet.getLinkState(number, names.index(link), computeForwardKinematics=True, physicsClientId=client)
+    result = np.eye(4)
+    result[:3, :3] = np.reshape(bullet.getMatrixFromQuaternion(state[5]), (3, 3))
+    result[:3, 3] = state[4]
+    return result

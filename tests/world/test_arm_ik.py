@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import random
-import subprocess
-import sys
 from collections.abc import Iterator
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import pycrorm_async
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import (
     COURIER,
@@ -31,7 +26,7 @@ from pycrorm_async.world.models import built_in_model
 from pycrorm_async.world.pose import Arms, Grasp, Pose, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
 from pycrorm_async.world.world_copy import counterpart
-from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
+from tests.world.fakes import angle_between, random_arm, random_base_pose
 
 # === arm ik ===================================================================================================
 #
@@ -52,17 +47,7 @@ def least_margin(arm: Arms, joints: dict[str, float], limits: Limits) -> float:
     return min(min(joints[name] - lower, upper - joints[name]) for name, (lower, upper) in bounds.items())
 
 
-@pytest.fixture
-def model(tmp_path: Path) -> Iterator[LoadedModel]:
-    path = tmp_path / "pr2.urdf"
-    path.write_text(built_in_model("pr2"), encoding="utf-8")
-    loaded = LoadedModel(path)
-    yield loaded
-    loaded.close()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("targets", [300, pytest.param(3_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("targets", [100, pytest.param(3_000, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("limits", Limits)
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_target_that_a_posture_within_limits_reaches_is_solved_exactly_within_limits(
@@ -77,80 +62,56 @@ def test_a_target_that_a_posture_within_limits_reaches_is_solved_exactly_within_
         reached_pose = reached(arm, answer, base=base, torso_height=torso_height)
         assert reached_pose.distance(target) < EXACT
         assert angle_between(reached_pose.orientation, target.orientation) < EXACT
-        assert least_margin(arm, answer, limits) >= 0
+        margin, one_step = least_margin(arm, answer, limits), 0.05
+        assert margin >= 0
+        assert margin > least_margin(arm, joints, limits) - one_step  # as far from the limits as any other posture
         assert tuple(answer) == PR2.arms[arm].joints
 
 
-@pytest.mark.parametrize("limits", Limits)
-@pytest.mark.parametrize("arm", ARMS)
-def test_solutions_reach_their_target_in_bullet_too(model: LoadedModel, arm: Arms, limits: Limits) -> None:
-    rng = random.Random(32)
-    tool = PR2.arms[arm].tool_frame
-    for _ in range(300):
-        base, torso_height = random_base_pose(rng)
-        torso = {PR2.torso_joint: torso_height}
-        model.put(base=base, joints=random_arm(rng, arm, limits) | torso)
-        target = model.link_pose(tool)
-        answer = solve_from(PR2, arm, target, base=base, torso_height=torso_height, limits=limits)
-        model.put(base=base, joints=answer | torso)
-        assert model.link_pose(tool).distance(target) < EXACT
-        assert angle_between(model.link_pose(tool).orientation, target.orientation) < EXACT
+def by_zeros() -> Pose:
+    return reached(Arms.LEFT, dict.fromkeys(PR2.arms[Arms.LEFT].joints, 0.0), base=Pose(), torso_height=0.0)
 
 
-@pytest.mark.parametrize("limits", Limits)
-def test_a_solution_stays_as_far_from_the_limits_as_any_other_posture(limits: Limits) -> None:
-    rng = random.Random(33)
-    for _ in range(1000):
-        joints = random_arm(rng, Arms.LEFT, limits)
-        target = reached(Arms.LEFT, joints, base=Pose(), torso_height=0.1)
-        answer = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.1, limits=limits)
-        one_step = 0.05
-        assert least_margin(Arms.LEFT, answer, limits) > least_margin(Arms.LEFT, joints, limits) - one_step
-
-
-def test_the_stretched_arm_is_within_hard_limits_and_outside_soft_ones() -> None:
-    for arm in ARMS:
-        stretched = dict.fromkeys(PR2.arms[arm].joints, 0.0)
-        target = reached(arm, stretched, base=Pose(), torso_height=0.0)
-        answer = solve_from(PR2, arm, target, base=Pose(), torso_height=0.0, limits=Limits.HARD)
-        assert reached(arm, answer, base=Pose(), torso_height=0.0).distance(target) < EXACT
-        with pytest.raises(Unreachable, match=r"too far: from shoulder to wrist 0\.721 m"):
-            solve_from(PR2, arm, target, base=Pose(), torso_height=0.0)
-
-
-@pytest.mark.parametrize("limits", Limits)
-@pytest.mark.parametrize("arm", ARMS)
-def test_a_target_three_metres_away_is_refused_as_too_far(arm: Arms, limits: Limits) -> None:
-    target = Pose([3.0, 0.0, 0.9])
-    with pytest.raises(Unreachable, match="too far: from shoulder to wrist") as refused:
-        solve_from(PR2, arm, target, base=Pose(), torso_height=0.0, limits=limits)
-    assert (refused.value.target, refused.value.arm) == (target, arm)
-    assert str(refused.value) == f"the {arm.name} arm cannot reach {target!r}: {refused.value.reason}"
-
-
-@pytest.mark.parametrize("limits", Limits)
-@pytest.mark.parametrize("grasp", Grasp)
-def test_a_wrist_inside_its_own_shoulder_is_refused_as_too_near(grasp: Grasp, limits: Limits) -> None:
+def on_shoulder(grasp: Grasp) -> Pose:
+    """Return a target that puts the wrist on the pan joint."""
     turn = GRASP_ORIENTATIONS[grasp]
     hand = rotated(turn, (0.18, 0.0, 0.0))
-    target = Pose([-0.05 + hand.x, 0.188 + hand.y, 0.790675 + hand.z], turn)
-    with pytest.raises(Unreachable, match="too near: from shoulder to wrist"):
+    return Pose([-0.05 + hand.x, 0.188 + hand.y, 0.790675 + hand.z], turn)
+
+
+BEHIND = Pose([-0.05 + 0.97 * math.cos(-2), 0.188 + 0.97 * math.sin(-2), 0.79], yaw_quaternion(-2))
+REFUSED = {
+    "stretched": (
+        by_zeros(),
+        Limits.SOFT,
+        "too far: from shoulder to wrist 0.721 m or more",
+    ),
+    "three metres away": (Pose([3.0, 0.0, 0.9]), Limits.HARD, "too far: from shoulder to wrist"),
+    "in the shoulder": (on_shoulder(Grasp.TOP), Limits.HARD, "too near: from shoulder to wrist"),
+    "in the shoulder, ahead": (on_shoulder(Grasp.FRONT), Limits.SOFT, "too near: from shoulder to wrist"),
+    "at the shoulder": (
+        Pose([0.23, 0.188, 0.79]),
+        Limits.SOFT,
+        "too near: from shoulder to wrist 0.200 m or less, but the arm needs 0.359 m",
+    ),
+    "behind": (BEHIND, Limits.SOFT, "its wrist would reach the target only with l_shoulder_pan_joint outside its soft"),
+    "from above": (Pose([0.6, 0.2, 0.9], GRASP_ORIENTATIONS[Grasp.TOP]), Limits.SOFT, "the best posture has l_"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_a_refusal_names_the_limit_that_prevents_it(what: str) -> None:
+    target, limits, reason = REFUSED[what]
+    with pytest.raises(Unreachable) as refused:
         solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0, limits=limits)
+    assert refused.value.reason.startswith(reason)
+    assert (refused.value.target, refused.value.arm) == (target, Arms.LEFT)
+    assert str(refused.value) == f"the LEFT arm cannot reach {target!r}: {refused.value.reason}"
 
 
-def test_a_refusal_names_the_limit_that_prevents_it() -> None:
-    def reason(target: Pose) -> str:
-        with pytest.raises(Unreachable) as refused:
-            solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0)
-        return refused.value.reason
-
-    at_the_shoulder = Pose([-0.05 + 0.1 + 0.18, 0.188, 0.79])
-    assert reason(at_the_shoulder) == ("too near: from shoulder to wrist 0.200 m or less, but the arm needs 0.359 m")
-    behind = Pose([-0.05 + 0.97 * math.cos(-2), 0.188 + 0.97 * math.sin(-2), 0.79], yaw_quaternion(-2))
-    assert reason(behind).startswith("its wrist would reach the target only with l_shoulder_pan_joint outside its ")
-    from_above = Pose([0.6, 0.2, 0.9], GRASP_ORIENTATIONS[Grasp.TOP])
-    assert reason(from_above).startswith("the best posture has l_")
-    assert "outside its soft limits" in reason(from_above)
+def test_the_stretched_arm_is_within_hard_limits() -> None:
+    answer = solve_from(PR2, Arms.LEFT, by_zeros(), base=Pose(), torso_height=0.0, limits=Limits.HARD)
+    assert reached(Arms.LEFT, answer, base=Pose(), torso_height=0.0).distance(by_zeros()) < EXACT
 
 
 @pytest.mark.parametrize(
@@ -167,48 +128,20 @@ def test_an_invalid_request_is_the_callers_error(arm: Arms, target: Pose, says: 
         solve_from(PR2, arm, target, base=Pose(), torso_height=0.0)
 
 
-FINGERPRINT = """
-import hashlib, random
-from pycrorm_async.world.kinematics import Unreachable, solve_from
-from pycrorm_async.world.pose import Arms
-from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.urdf import PR2
-rng, seen = random.Random(36), hashlib.sha256()
-for _ in range(400):
-    target = Pose([rng.uniform(0, 0.9), rng.uniform(-0.3, 0.8), rng.uniform(0.3, 1.2)],
-                  [rng.gauss(0, 1) for _ in range(4)])
-    try:
-        answer = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.2)
-        seen.update(" ".join(map(float.hex, answer.values())).encode())
-    except Unreachable as refused:
-        seen.update(refused.reason.encode())
-"""
-
-
-def test_the_same_request_has_the_same_answer_to_the_bit_here_again_and_in_another_process() -> None:
-    def here() -> str:
-        names: dict[str, hashlib._Hash] = {}
-        exec(FINGERPRINT, names)
-        return names["seen"].hexdigest()
-
-    root = str(Path(pycrorm_async.__file__).parents[1])
-    script = f"import sys; sys.path.insert(0, {root!r})\n{FINGERPRINT}print(seen.hexdigest())"
-    elsewhere = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
-    assert here() == here() == elsewhere.stdout.strip()
-
-
 # --- the robot of a world -------------------------------------------------------------------------------------------
 
 
-def test_a_solution_uses_the_robots_pose_in_the_world_and_does_not_move_it() -> None:
+def test_a_solution_uses_the_robots_pose_and_torso_or_those_passed_and_does_not_move_it() -> None:
     with BulletWorld():
         robot = Object("pr2", ObjectType.ROBOT, pose=Pose([1.0, -0.5, 0.0], yaw_quaternion(0.7)))
         robot.set_joint_position("torso_lift_joint", 0.25)
         before = (robot.pose, robot.joint_positions())
         target = robot.pose @ Pose([0.65, -0.3, 1.0])
         answer = solve(robot, Arms.RIGHT, target)
+        lower = solve(robot, Arms.RIGHT, target, torso_height=0.0)
         assert (robot.pose, robot.joint_positions()) == before
         assert answer == solve_from(PR2, Arms.RIGHT, target, base=robot.pose, torso_height=0.25)
+        assert lower == solve_from(PR2, Arms.RIGHT, target, base=robot.pose, torso_height=0.0) != answer
         robot.set_joint_positions(answer)
         assert robot.link_pose("r_gripper_tool_frame").distance(target) < EXACT
 
@@ -226,26 +159,10 @@ def test_hard_limits_are_those_of_the_loaded_model_if_they_are_narrower() -> Non
             solve(robot, Arms.LEFT, target, limits=Limits.HARD)
 
 
-def test_a_robot_without_a_description_is_the_callers_error() -> None:
-    with BulletWorld():
-        cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL)
-        with pytest.raises(CallerError, match="cereal"):
-            solve(cereal, Arms.LEFT, AHEAD)
-
-
-def test_another_torso_height_has_the_solution_of_that_torso_and_nothing_moves() -> None:
-    with BulletWorld():
-        robot = Object("pr2", ObjectType.ROBOT)
-        asked = solve(robot, Arms.LEFT, AHEAD, torso_height=0.25)
-        assert robot.joint_position("torso_lift_joint") == 0
-        assert asked != solve(robot, Arms.LEFT, AHEAD)
-        robot.set_joint_position("torso_lift_joint", 0.25)
-        assert asked == solve(robot, Arms.LEFT, AHEAD)
-        assert asked != solve(robot, Arms.LEFT, AHEAD, torso_height=0.0)
-
-
-@pytest.mark.parametrize(("name", "arm"), [("pr2", Arms.LEFT), ("pr2", Arms.RIGHT), ("courier", Arms.RIGHT)])
-@pytest.mark.parametrize("limits", Limits)
+@pytest.mark.parametrize(
+    ("name", "arm", "limits"),
+    [("pr2", Arms.LEFT, Limits.SOFT), ("pr2", Arms.RIGHT, Limits.HARD), ("courier", Arms.RIGHT, Limits.SOFT)],
+)
 def test_what_is_out_of_reach_has_no_solution_and_most_without_one_are_out_of_reach(
     name: str, arm: Arms, limits: Limits
 ) -> None:
@@ -256,7 +173,7 @@ def test_what_is_out_of_reach_has_no_solution_and_most_without_one_are_out_of_re
         robot = Object(name, ObjectType.ROBOT, pose=Pose([1, 2, 0], [0, 0, 1, 1]))
         if name == "pr2":
             robot.set_joint_position("torso_lift_joint", 0.2)
-        for _ in range(12):
+        for _ in range(6):
             goal = Pose(rng.uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.2]).tolist(), rng.normal(size=4).tolist())
             at = rng.uniform(-1.1, 1.1, (10, 2)).tolist()
             bases = [Pose((x, y, 0.0), yaw_quaternion(-math.atan2(y, -x))) for x, y in at]
@@ -297,22 +214,15 @@ def test_reachable_poses_are_reached_to_a_micrometre_as_bullet_sees_them(courier
     rng = np.random.default_rng(3)
     chain = chain_of(courier, Arms.RIGHT)
     lower, upper = zip(*(chain.bounds[name] for name in chain.joints), strict=True)
-    for _ in range(200):
+    for _ in range(50):
         angles = dict(zip(chain.joints, map(float, rng.uniform(lower, upper)), strict=True))
         courier.set_joint_positions(angles)
         goal = courier.link_pose("tool_frame")
         courier.set_joint_positions(dict.fromkeys(chain.joints, 0.0))
         answer = solve(courier, Arms.RIGHT, goal)
-        assert answer == solve(courier, Arms.RIGHT, goal)
         courier.set_joint_positions(answer)
         assert courier.link_pose("tool_frame").distance(goal) < 1e-5
-
-
-def test_the_answer_does_not_depend_on_the_current_posture(courier: Object) -> None:
-    goal = Pose([1, 2.6, 0.9], courier.pose.orientation)
-    before = solve(courier, Arms.RIGHT, goal)
-    courier.set_joint_positions(before)
-    assert solve(courier, Arms.RIGHT, goal) == before
+        assert solve(courier, Arms.RIGHT, goal) == answer  # whatever its posture
 
 
 def test_a_target_too_far_is_refused_with_both_distances(courier: Object) -> None:
@@ -381,9 +291,8 @@ def test_a_description_that_does_not_fit_the_model_is_refused_by_name() -> None:
         unfit = RobotDescription(name="unfit", urdf=built_in_model("courier"), arms={Arms.LEFT: wrong})
         with BulletWorld(), pytest.raises(CallerError, match=named):
             solve(Object("unfit", ObjectType.ROBOT, robot=unfit), Arms.LEFT, Pose([0.6, 0, 0.8]))
-
-
-def test_an_arm_without_a_joint_is_refused() -> None:
+    with BulletWorld(), pytest.raises(CallerError, match="cereal"):
+        solve(Object("cereal", ObjectType.BREAKFAST_CEREAL), Arms.LEFT, AHEAD)
     with pytest.raises(CallerError, match="'tool_frame' has none"):
         ArmDescription(joints=(), tool_frame="tool_frame")
 

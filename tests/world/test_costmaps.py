@@ -218,18 +218,3 @@ def test_maps_of_another_place_size_or_resolution_are_not_multiplied(other: Cost
 def test_a_map_is_read_only() -> None:
     with pytest.raises(ValueError, match="read-only"):
         GaussianCostmap(Pose()).map[0, 0] = 1.0
-
-
-def test_the_same_world_yields_the_same_map(world: BulletWorld) -> None:
-    Object("kitchen", ObjectType.ENVIRONMENT)
-    cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
-    ground = Pose([1.3, 0.7, 0])
-
-    def places() -> list[Pose]:
-        seen = VisibilityCostmap(world, cereal, min_height_m=1.27, max_height_m=1.6, origin=ground)
-        return (OccupancyCostmap(world, ground) * GaussianCostmap(ground) * seen).best(600)
-
-    first = places()
-    assert first == places()
-    assert len(first) == 600
-    assert all(place.position.x < 1.05 for place in first)

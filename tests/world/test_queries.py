@@ -9,7 +9,7 @@ import pytest
 
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.kinematics import solve
-from pycrorm_async.world.models import box_urdf, pr2_mesh_urdf_path
+from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.queries import Footprint, Obstacles, collisions_at, footprint_of
 from tests import bullet
@@ -187,18 +187,10 @@ def box(world: BulletWorld, name: str, pose: Pose, *, z: tuple[float, float] = (
     return Object(name, ObjectType.GENERIC_OBJECT, urdf, pose, world=world)
 
 
-@pytest.mark.parametrize("mesh", [False, True])
-def test_the_footprint_of_a_base_is_read_from_its_model(world: BulletWorld, mesh: bool) -> None:
-    pose = Pose([1.0, 2.0, 0.0], yaw_quaternion(0.7))
-    robot = Object("pr2", ObjectType.ROBOT, pr2_mesh_urdf_path() if mesh else None, pose, world=world)
-    side = 0.334 if mesh else 0.325
-    footprint = footprint_of(robot, ["base_link"])
-    assert [*footprint.x, *footprint.y] == pytest.approx([-side, side, -side, side], abs=2e-4)
-    assert footprint.inner_radius_m == pytest.approx(side, abs=2e-4)
-
-
 def test_objects_on_the_base_widen_its_footprint(world: BulletWorld) -> None:
-    robot = Object("pr2", ObjectType.ROBOT, world=world)
+    robot = Object("pr2", ObjectType.ROBOT, pose=Pose([0, 0, 0], yaw_quaternion(0.7)), world=world)
+    assert footprint_of(robot, ["base_link"]).y == pytest.approx((-0.325, 0.325))
+    robot.set_pose(Pose())
     crate = Object("crate", ObjectType.GENERIC_OBJECT, box_urdf("crate", x=(0.0, 0.5), y=(-0.1, 0.1), z=(0.4, 0.5)),
                    world=world)  # fmt: skip
     robot.attach(crate, "base_link")
@@ -246,7 +238,7 @@ def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld
     ]
     footprint, obstacles = footprint_of(robot, ["base_link"]), Obstacles(world)
     counts = [0, 0]
-    for _ in range(2_000):
+    for _ in range(400):
         base = Pose([rng.uniform(-3, 3), rng.uniform(-3, 3), 0], yaw_quaternion(rng.uniform(-3, 3)))
         robot.set_pose(base)
         hit = any(
@@ -262,7 +254,7 @@ def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld
         deeper = obstacles.overlapping(Footprint((-0.32, 0.32), (-0.32, 0.32)), base) is not None
         assert overlapped or not hit
         assert hit or not deeper  # upright boxes have exact outlines
-    assert min(counts) > 400
+    assert min(counts) > 80
 
 
 def test_many_bases_are_clear_where_each_alone_is(world: BulletWorld) -> None:
@@ -299,11 +291,3 @@ def test_a_transparent_hand_in_front_of_an_object_does_not_hide_it(world: Bullet
     assert world.met_towards(cereal, eye, ignore={milk}) != without_hand
     world.remove(milk)
     assert world.met_towards(cereal, eye, ignore={robot, milk}) == without_hand
-
-
-def test_an_object_is_opaque_again_after_the_query(world: BulletWorld) -> None:
-    robot = Object("pr2", ObjectType.ROBOT, pose=Pose([1, 0, 0]))
-    ray = ([(0.0, 0.0, 0.2)], [(2.0, 0.0, 0.2)])
-    assert world.ray_test(*ray) == [robot]
-    assert world.ray_test(*ray, ignore=[robot]) == [None]
-    assert world.ray_test(*ray) == [robot]
