@@ -19,7 +19,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -45,6 +45,9 @@ SETTINGS: Final = Settings(
     spool_reserve_bytes=2**17,
     flush_timeout_s=60,
 )
+FAULT_SETTINGS: Final = replace(SETTINGS, flush_timeout_s=5)
+"""SQLite ignores that an unlock of its index failed. It keeps the lock for all connections of the process ("locking
+protocol") until the last of them is closed, so every flush and the close end with their patience."""
 EPISODES, STEPS = 2, 4
 _HANGS_S = 300
 
@@ -213,7 +216,8 @@ def _say(*words: object) -> None:
 
 def perform(folder: str, shadow: str, fault: list[Any]) -> None:
     """Perform the plan with a fault of the disk."""
-    _run_with(folder, shadow, fault, partial(_perform, f"sqlite:///{folder}/memory.db"))
+    settings = SETTINGS if fault[0] == "cut" else FAULT_SETTINGS
+    _run_with(folder, shadow, fault, partial(_perform, f"sqlite:///{folder}/memory.db", settings))
 
 
 def record(folder: str, shadow: str, fault: list[Any]) -> None:
@@ -234,8 +238,8 @@ def _run_with(folder: str, shadow: str, fault: list[Any], plan: Callable[[], Any
     _say("counts", disk.disk_syncs(), disk.disk_calls(), disk.disk_failed().decode())
 
 
-async def _perform(url: str) -> None:
-    memory = Memory.open(url, settings=SETTINGS)
+async def _perform(url: str, settings: Settings) -> None:
+    memory = Memory.open(url, settings=settings)
     try:
         await memory.__aenter__()
     except PycrormError as error:
