@@ -129,16 +129,3 @@ def traces(url: str) -> list[str]:
         return traces_left + [name for (name,) in ask(url, gone)]
     file = Path(url.removeprefix("sqlite:///"))
     return traces_left + [each.name for each in file.parent.glob(f"{file.name}-rebuild*")]
-
-
-__all__ = [
-    "TYPES",
-    "WHISPERING",
-    "folded_elsewhere",
-    "lost",
-    "parking",
-    "picking",
-    "str_of",
-    "traces",
-    "whispering",
-]

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
 import re
-import signal
 from collections.abc import Sequence
 from typing import Any
 
 import pytest
 from sqlalchemy import column, func, select, table, text
-from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
@@ -26,22 +22,16 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections import custom_tables, pipeline
+from pycrorm_async.projections import custom_tables
 from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection
-from pycrorm_async.projections.custom_tables import learner_of, states
+from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.fold import decode_events
-from pycrorm_async.projections.generations import PROJECTION
 from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.projections.pipeline import FoldRunner, SideTarget
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import share_out
-from tests.commands import FORKED, fork
 from tests.projections.event_script import (
     MOVE,
     PICK_UP,
@@ -56,6 +46,7 @@ from tests.projections.event_script import (
     row,
 )
 from tests.projections.sql_queries import ask, lose_event, names
+from tests.projections.verify_cases import rebuilt
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 
@@ -125,13 +116,6 @@ async def visible_rows(log: EventLog) -> list[tuple[Any, ...]]:
     return await ask(log, "SELECT * FROM grasp_try ORDER BY id")
 
 
-async def rebuilt(log: EventLog, projection: Projection) -> None:
-    async with claimed(log):
-        rebuild = await Rebuild.begin(log, projection=projection)
-        await rebuild.show()
-        assert await clear(log) == []
-
-
 class Stands(Projection):
     name, version = "stands", 1
     tables = {"stand": {"x": "real", "target": "json"}}  # noqa: RUF012 - a common form in user code
@@ -199,43 +183,6 @@ async def test_an_unreadable_declaration_stops_nothing_else(log: EventLog) -> No
     strange = [declarations(PICK_UP)[0]._replace(payload=each) for each in payloads]
     await folded(log, [*declarations(PICK_UP), *strange, *tries().records], GraspRate())
     assert await visible_rows(log) == rows_of(1)
-
-
-async def test_a_batch_that_another_process_has_folded_meanwhile_is_not_written(log: EventLog) -> None:
-    script = tries()
-    await folded(log, [*declarations(PICK_UP), *script.records[:4]], GraspRate())
-    await folded(log, script.records[4:])  # a process that folds the memory's own tables only
-    other = await EventLog.open(log.address, create=True)
-    try:
-        folds = []
-        for each in (log, other):
-            target = SideTarget(each, f"{PROJECTION}grasp_rate", "grasp_rate", GraspRate.version)
-            folds.append(FoldRunner(target, learner_of(GraspRate())))
-            async with each.reading() as connection:
-                behind = await target.behind(connection, 0, 100)
-            await folds[-1].prepare(share_out(behind, 100))
-        assert [await each.write() for each in folds] == [len(script.records) - 4, 0]
-    finally:
-        await other.close()
-    assert await visible_rows(log) == rows_of(1)
-    [state] = await states(log, [GraspRate()])
-    assert (state.behind, state.parked) == (0, {})
-
-
-async def test_a_fold_that_raises_stops_its_episode_and_no_other(
-    log: EventLog, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pipeline, "_PAGE_EVENTS", 4)
-    left = [each for each in TRIES if each[0] == "LEFT"]
-    records = [*declarations(PICK_UP), *mixed(tries(1), tries(2, many=left))]
-    await folded(log, records, NoLeftHand())
-    assert await visible_rows(log) == [*rows_of(1)[:2], *rows_of(2, left)]  # the event that raised has left no row
-    assert await ask(log, "SELECT number, folded, parked FROM episode ORDER BY number") == [(1, 9, None), (2, 7, None)]
-    (state,) = await states(log, [])
-    assert state.parked == {1: "event 7: grasp_rate raised ZeroDivisionError: no right hand"}
-    assert "episode 1 is parked in the projection grasp_rate: event 7" in caplog.text
-    await rebuilt(log, GraspRate())
-    assert await visible_rows(log) == [*rows_of(1), *rows_of(2, left)]
 
 
 async def test_the_reason_why_a_process_stops_folding_it_remains_until_the_projection_is_set_up_again(
@@ -405,9 +352,7 @@ async def test_a_rebuild_makes_the_same_rows_as_live_folding_and_one_of_the_memo
     assert not [each for each in await names(log, "table") if "grasp_" in each and each.endswith("__1001")]
     await log.append(tries(3).records)  # a process that folded the old tables continues with the new ones
     await projector.catch_up()
-    async with claimed(log):
-        await (await Rebuild.begin(log)).show()
-        assert await clear(log) == []
+    await rebuilt(log)
     assert await visible_rows(log) == [*rows_of(1), *rows_of(2), *rows_of(3)]
 
 
@@ -449,43 +394,6 @@ async def test_verify_reports_a_fold_that_was_changed_without_a_new_version(log:
         " 'parked: grasp_rate raised ZeroDivisionError: no right hand'"
     )
     assert (await verify(log, projections=[NextGraspRate()])).not_compared.keys() == {"grasp_rate"}
-
-
-def _die_in_rebuild(url: str, last: int) -> None:
-    """Rebuild four events at a time, and die when that many batches are written and the last is not committed."""
-    write, count = CustomRows.write, 0
-
-    async def count_written(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
-        nonlocal count
-        await write(self, connection, generation)
-        count += 1
-        if count == last:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    async def fold() -> None:
-        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-        async with claimed(log):
-            await (await Rebuild.begin(log, projection=GraspRate())).show()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CustomRows, "write", count_written)
-        patch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 4)
-        asyncio.run(fold())
-
-
-async def test_a_killed_rebuild_continues_where_it_was(log: EventLog, database_url: str) -> None:
-    await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], GraspRate())
-    for last in (1, 2):
-        process = FORKED.Process(target=_die_in_rebuild, args=(database_url, last))
-        fork(process)
-        await asyncio.to_thread(process.join)
-        assert process.exitcode == -signal.SIGKILL
-    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
-    async with claimed(log):
-        assert await (await Rebuild.begin(log, projection=GraspRate())).left() == 18 - 4
-    await rebuilt(log, GraspRate())
-    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
-    assert (await verify(log, projections=[GraspRate()])).drift == 0
 
 
 @pytest.mark.parametrize("batch_events", [1, 100])

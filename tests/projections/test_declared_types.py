@@ -94,14 +94,6 @@ async def test_names_that_a_database_reserves_are_columns_of_the_view_and_are_re
         await rebuilt(log)
 
 
-async def test_the_name_of_an_index_is_short_however_long_table_and_column_are(log: EventLog) -> None:
-    reach = with_fields("ReachIntoTheUpperLeftKitchenCupboardAction", "object", "container_id")
-    assert len(index_name(reach.table, reach.fields[0].column, 7)) == 63
-    await stored_and_folded(log, [*declarations(reach), *performing(1, reach)])
-    assert await parked_reasons(log) == []
-    await assert_verified(log)
-
-
 def test_names_fit_for_every_generation_and_are_unique() -> None:
     tables = ["a" * 60, "a" * 59 + "b", "ñ" * 30]
     for generation in (1, 7, 10, 123_456_789):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import signal
 from collections import Counter
 from collections.abc import Sequence
 from random import Random
@@ -27,15 +25,13 @@ from pycrorm_async.projections.custom import (
 )
 from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
-from tests.commands import FORKED, fork
 from tests.projections.event_script import PICK_UP, Script, declarations, mixed, name_of, row
 from tests.projections.sql_queries import ask
+from tests.projections.verify_cases import rebuilt
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """As in `test_custom_projections`."""
@@ -112,13 +108,6 @@ async def rows_in(log: EventLog) -> list[tuple[Any, ...]]:
     return await ask(log, "SELECT * FROM attempt ORDER BY id")
 
 
-async def rebuilt(log: EventLog) -> None:
-    async with claimed(log):
-        rebuild = await Rebuild.begin(log, projection=Attempts())
-        await rebuild.show()
-        await clear(log)
-
-
 async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,7 +134,7 @@ async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
     assert await rows_in(log) == rows
     result = await verify(log, projections=[Attempts()])
     assert (result.drift, result.damage) == (0, 0)
-    await rebuilt(log)
+    await rebuilt(log, Attempts())
     assert await rows_in(log) == rows
 
 
@@ -269,23 +258,8 @@ async def test_a_fold_that_fails_stops_its_episode_also_where_it_is_read_again(
         1: "event 6: event 3, read again: ZeroDivisionError: not again",
         2: "event 3: attempts raised ZeroDivisionError: not again",
     }
-    await rebuilt(log)
+    await rebuilt(log, Attempts())
     assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
-
-
-async def test_a_row_that_the_database_refuses_stops_its_episode_alone(log: EventLog) -> None:
-    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
-    scripts = [episode(number, tries, ends=False) for number in (1, 2)]
-    await log.append([*declarations(PICK_UP), *mixed(*scripts)])
-    projector = await projector_of(log)
-    async with log.engine.begin() as connection:
-        table = "zz_pycrorm_own_attempt__1001"
-        await connection.exec_driver_sql(f"INSERT INTO {table} (id, process_metadata_id) VALUES ({row(5)}, 1)")
-    await projector.catch_up()
-    (state,) = await states(log, [])
-    assert state.parked.keys() == {1}
-    refused = (row(5), 1, None, None, None)
-    assert await rows_in(log) == [expected(1, tries)[0], refused, *expected(2, tries, ends=False)]
 
 
 async def test_a_projection_that_cannot_be_written_leaves_the_batch_of_the_tables_whole(
@@ -312,38 +286,3 @@ async def test_a_projection_that_cannot_be_written_leaves_the_batch_of_the_table
     assert len(await rows_in(log)) == 2
     await projector.catch_up()
     assert await rows_in(log) == expected(1, tries)
-
-
-def _die_in_second_batch(url: str) -> None:
-    write, count = CustomRows.write, 0
-
-    async def counted_write(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
-        nonlocal count
-        await write(self, connection, generation)
-        count += 1
-        if count == 2:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    async def fold() -> None:
-        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-        await (await projector_of(log, batch_events=6)).catch_up()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CustomRows, "write", counted_write)
-        asyncio.run(fold())
-
-
-async def test_a_killed_fold_continues_with_the_state_of_its_episodes(log: EventLog, database_url: str) -> None:
-    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED"), ("RIGHT", "FAILED"), ("LEFT", "FAILED")]
-    records = [*declarations(PICK_UP), *mixed(episode(1, tries), episode(2, tries))]
-    await log.append(records)
-    await projector_of(log)
-    process = FORKED.Process(target=_die_in_second_batch, args=(database_url,))
-    fork(process)
-    await asyncio.to_thread(process.join)
-    assert process.exitcode == -signal.SIGKILL
-    assert len(await rows_in(log)) == 2
-    assert await ask(log, "SELECT sum(folded) FROM episode") == [(6,)]
-    await (await projector_of(log)).catch_up()
-    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
-    assert (await verify(log, projections=[Attempts()])).drift == 0

@@ -177,20 +177,6 @@ def test_the_end_of_a_node_from_an_earlier_batch_is_an_update_without_a_time_if_
     ]
 
 
-def test_a_lost_episode_makes_its_running_nodes_lost() -> None:
-    script = Script()
-    root = script.put(NodeStarted("root"))
-    done = script.put(NodeStarted("action", root, name_of(SAYING), {"text": "a"}))
-    script.put(NodeEnded(done, "SUCCEEDED"))
-    script.put(EpisodeEnded("LOST"))
-    rows = folded(script, SAYING, number=3)
-    assert [(each[0], each[5]) for each in rows.nodes.values()] == [
-        (row(1, number=3), "LOST"),
-        (row(2, number=3), "SUCCEEDED"),
-    ]
-    assert rows.lost == [3]
-
-
 def test_every_type_of_field_has_its_column_and_its_rows() -> None:
     script = Script()
     milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
@@ -241,27 +227,6 @@ def test_every_type_of_field_has_its_column_and_its_rows() -> None:
     ]  # fmt: skip
 
 
-def test_a_part_and_a_believed_object_have_rows_of_their_own() -> None:
-    opening = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("cup", "object", 3))
-    script = Script()
-    fridge = script.put(ObjectAdded("fridge", "ENVIRONMENT", pose()))
-    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1, 1, 1), ObjectReference(fridge, fridge))
-    cup = ObjectValue("BelieveObject", "cup")
-    script.put(NodeStarted("action", None, name_of(opening), {"object_designator": handle, "cup": cup}))
-    rows_by_table = rows_of(script, opening)
-    assert rows_by_table["object"][1:] == [
-        (
-            row(2, 2), 1, "ObjectPart", "handle", "GENERIC_OBJECT", row(2, 2), row(1), None, time_us(2), row(2),
-            *[None] * 7,
-        ),
-        (row(2, 3), 1, "BelieveObject", "cup", None, None, None, None, time_us(2), row(2), *[None] * 7),
-    ]  # fmt: skip
-    assert rows_by_table["pose"][1:] == [(row(2, 2), 1, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
-    assert rows_by_table["open_action(id,process_metadata_id,object_designator_id,cup_id)"] == [
-        (row(2), 1, row(2, 2), row(2, 3))
-    ]
-
-
 def test_a_value_recorded_as_missing_or_left_out_is_null() -> None:
     script = Script()
     script.put(NodeStarted("action", None, name_of(PICK_UP), {"arm": MissingValue("no member", "<x>")}))
@@ -307,22 +272,6 @@ def test_an_event_that_cannot_be_folded_names_the_reason_and_leaves_no_row(event
     assert str(raised.value) == reason
     assert rows.to_insert() == {}
     assert rows.node_ends == []
-
-
-@pytest.mark.parametrize(
-    ("type_", "payload", "version", "reason"),
-    [
-        ("RobotDanced", b"{}", 1, "RobotDanced is not an event type of this version"),
-        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 4, "NodeEnded has version 4, this version reads 3"),
-        ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
-    ],
-)
-def test_an_event_of_an_unknown_version_cannot_be_folded(type_: str, payload: bytes, version: int, reason: str) -> None:
-    script = Script()
-    script.put_payload(type_, payload, version)
-    with pytest.raises(CannotFold) as raised:
-        fold(script.stored()[0], Designators(), Rows())
-    assert str(raised.value) == reason
 
 
 def test_a_dict_field_may_contain_the_key_missing_among_others() -> None:

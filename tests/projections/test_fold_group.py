@@ -75,17 +75,6 @@ async def test_each_process_has_a_share_of_its_own_and_that_of_a_dead_one_is_tak
     assert sorted(await shares_of(folders[1:])) == [(0, 2), (1, 2)]  # it has joined again
 
 
-async def test_a_session_of_the_group_prepares_each_of_its_statements_once(folders: list[LogAndTables]) -> None:
-    group = folders[0].group
-    for _ in range(3):
-        await folders[0].has_unfolded()
-        await folders[0].behind()
-    assert group._session is not None
-    executed = "SELECT generic_plans + custom_plans FROM pg_prepared_statements WHERE starts_with(statement, {!r})"
-    counts = (await group._session.exec_driver_sql(executed.format("SELECT pg_catalog.pg_advisory"))).scalars()
-    assert sorted(counts) == [1, 2, 3]  # joined once, forgot a look twice, looked three times
-
-
 async def test_each_folds_the_episodes_of_its_share_and_sees_those_of_the_others(folders: list[LogAndTables]) -> None:
     await shares_of(folders)
     await folders[0].append([started(each) for each in range(1, 31)])

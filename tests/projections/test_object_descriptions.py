@@ -19,12 +19,12 @@ from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectDescription
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.databases import ask, ask_to_change, run_in_own_loop
 from tests.projections.verify_cases import unlock, verified
 from tests.table_comparison import declarations_of, differences, tables_of
+
+pytestmark = pytest.mark.soak_on("postgresql")
 
 RED = (1.0, 0.0, 0.0, 0.5)
 WEDGE = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
@@ -105,22 +105,6 @@ async def test_the_log_can_be_read_by_hand(described: str) -> None:
     ]  # fmt: skip
 
 
-async def test_designator_types_are_read_without_the_descriptions(described: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(described), create=False)
-    try:
-        types = await log.declarations()
-        names = [name for (name,) in ask(described, f"SELECT fingerprint {DESCRIBED}")]
-        assert b"urdf" not in b"".join(types)
-        assert (await log.descriptions([*names, "urdf-missing"])).keys() == {*names}
-        assert await log.descriptions([]) == {}
-    finally:
-        await log.close()
-    assert ask(described, "SELECT count(*) FROM pycrorm_declaration") == [(len(types) + 3,)]
-    assert ask(described, "SELECT count(*) FROM designator_type") == [(len(types),)]
-    assert ask(described, "SELECT count(*) FROM object_description") == [(3,)]
-
-
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.slow
 async def test_a_copy_and_a_rebuild_have_the_same_descriptions(described: str, tmp_path: Path) -> None:
     target = f"sqlite:///{tmp_path / 'copy.db'}"

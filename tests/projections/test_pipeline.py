@@ -50,16 +50,6 @@ class LosesAnswers(WorkerInLoop):
         return 0
 
 
-class LosesBatches(WorkerInLoop):
-    """Lose every third batch before writing it."""
-
-    requests = 0
-
-    async def write(self) -> int:
-        self.requests += 1
-        return 0 if self.requests % 3 == 0 else await super().write()
-
-
 class DiesOften(WorkerInLoop):
     """Die at every third request, so that another worker replaces it."""
 
@@ -180,7 +170,6 @@ def words_of(number: int, words: int, *, episode: int | None = None) -> list[tup
     [
         (WorkerInLoop, 2),
         (LosesAnswers, 2),
-        (LosesBatches, 2),
         (DiesOften, 2),
         (WritesTwice, 3),
     ],

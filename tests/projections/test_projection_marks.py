@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import random
-import sqlite3
 from collections.abc import AsyncIterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +17,13 @@ from pycrorm_async.projections import pipeline
 from pycrorm_async.projections.custom import Changes, Event, Projection
 from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 from tests.projections.event_script import Script
 from tests.projections.sql_queries import ask
+from tests.projections.verify_cases import rebuilt
 
 pytestmark = pytest.mark.slow
 
@@ -172,12 +170,10 @@ class Walk:
         await projector.fold_rest()
 
     async def rebuild(self) -> None:
-        async with claimed(self.log):
-            await (await Rebuild.begin(self.log, projection=Nodes())).show()
-            assert await clear(self.log) == []
+        await rebuilt(self.log, Nodes())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.usefixtures("moved_at_once")
 async def test_a_complete_fold_leaves_nothing_behind_the_mark_whatever_happened_before(
     log: EventLog, seed: int
@@ -194,20 +190,6 @@ async def test_a_complete_fold_leaves_nothing_behind_the_mark_whatever_happened_
         assert await behind(log) == 0
         marks.update(await mark_of(log))
     assert len(marks) > 10
-
-
-@pytest.mark.usefixtures("moved_at_once")
-async def test_the_mark_is_before_the_first_event_that_the_projection_lacks(log: EventLog) -> None:
-    projector = await folding(log, Nodes())
-    first, second, third = (begun(number) for number in (1, 2, 3))
-    await log.append(first.records)
-    await projector.catch_up()
-    assert await mark_of(log) == [(1, 2)]
-    await log.append([*second.records, *third.records])
-    assert await projector.fold_rest() is False  # the tables do not have these episodes yet
-    assert await mark_of(log) == [(1, 2)]
-    await projector.catch_up()
-    assert await mark_of(log) == [(3, 2)]
 
 
 @pytest.mark.usefixtures("moved_at_once")
@@ -230,44 +212,3 @@ async def test_events_that_are_stored_while_the_mark_is_moved_are_behind_it(
     assert await mark_of(log) == [(1, 2)]
     await projector.catch_up()
     assert await behind(log) == 0
-
-
-@pytest.mark.usefixtures("moved_at_once")
-async def test_a_removal_ends_the_mark_because_a_restored_episode_may_get_the_same_rowids(log: EventLog) -> None:
-    projector, script = await folding(log, Nodes()), begun(1)
-    script.put(EpisodeEnded("SUCCEEDED"))
-    other = begun(2)
-    await log.append([*other.records, *script.records])
-    await projector.catch_up()
-    rowids = await ask(log, "SELECT rowid FROM event WHERE episode = 2")
-    [row] = [each for each in await log.episodes() if each.ended_wall_ns]
-    await remove(log, [row], reason="old", archived_in="lake")
-    log.blobs.restores = True
-    await log.append(script.records)
-    assert await ask(log, "SELECT rowid FROM event WHERE episode = 2") == rowids
-    await projector.catch_up()
-    assert await behind(log) == 0
-    assert await ask(log, "SELECT count(*) FROM own_node") == [(2,)]
-
-
-@pytest.mark.usefixtures("moved_at_once")
-async def test_a_memory_that_is_written_anew_from_a_dump_keeps_its_mark_although_rowids_change(
-    log: EventLog, tmp_path: Path
-) -> None:
-    projector, ended, last = await folding(log, Nodes()), begun(1), begun(2)
-    ended.put(EpisodeEnded("SUCCEEDED"))
-    await log.append([*ended.records, *last.records])
-    await projector.catch_up()
-    await remove(log, [(await log.episodes())[0]], reason="old")
-    last.put(NodeStarted("action", 2))
-    await log.append(last.records)
-    await projector.catch_up()
-    with closing(sqlite3.connect(tmp_path / "memory.db")) as file, closing(sqlite3.connect(tmp_path / "new.db")) as new:
-        new.executescript("\n".join(file.iterdump()))
-    async with await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/new.db"), create=True) as written:
-        assert await mark_of(written) == await mark_of(log) == [(2, 3)]
-        assert await ask(written, "SELECT max(rowid) FROM event") < await ask(log, "SELECT max(rowid) FROM event")
-        last.put(NodeStarted("action", 2))
-        await written.append([*last.records, *begun(3).records])
-        await (await folding(written, Nodes())).catch_up()
-        assert await behind(written) == 0

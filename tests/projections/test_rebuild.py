@@ -23,7 +23,7 @@ from pycrorm_async.projections import rebuild as steps
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.pipeline import FoldRunner, LiveTarget
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed
+from pycrorm_async.projections.rebuild import Rebuild
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -49,10 +49,9 @@ OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where
 async def every_kind_of_episode(url: str, spool: Path) -> None:
     """Return random plans with types of their own and failures, a simulation, a lost episode, and a parked one."""
     async with Memory.open(url, spool=spool, views=[OUR_VIEW], settings=PATIENT) as memory:
-        for seed in range(3):
-            await play(seed, memory)
+        await play(0, memory)
         await memory.flush()
-    scripts = [*map(picking, range(1, 8)), picking(8, simulated=True), lost(9), parking(10)]
+    scripts = [*map(picking, range(1, 4)), picking(8, simulated=True), lost(9), parking(10)]
     # Live, a node ends and is lost in another batch than that of its start; a rebuild folds both in one.
     await append_and_fold(url, [*TYPES, *(each for script in scripts for each in script.records[:4])])
     await append_and_fold(url, [each for script in scripts for each in script.records[4:]])
@@ -216,22 +215,6 @@ async def test_events_folded_while_the_new_tables_are_published_are_in_them(
     assert await log.append(picking(999).records) == {}
     await projector.catch_up()
     assert ask(database_url, "SELECT count(*) FROM process_metadata") == [(29,)]
-    await log.close()
-
-
-@pytest.mark.soak_on("postgresql")
-async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next batch of an episode longer than one batch begins where the batch that is being written ends."""
-    monkeypatch.setattr(steps, "_BATCH_EVENTS", 10)
-    await append_and_fold(database_url, [*TYPES, *picking(1, nodes=100).records, *picking(2).records])
-    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
-    async with claimed(log):
-        rebuild = await Rebuild.begin(log)
-        total, counts = await rebuild.left(), []
-        while (count := await rebuild.fold_next_batch()) is not None:
-            counts.append(count)
-        assert (sum(counts), min(counts) > 0) == (total, True)
-        await rebuild.show()
     await log.close()
 
 

@@ -10,10 +10,9 @@ from sqlalchemy import select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.codec import Heading, Record, decode
+from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.types import (
     BlobReference,
-    DescriptionDeclared,
     JointsMoved,
     NodeEnded,
     NodeStarted,
@@ -243,34 +242,6 @@ async def test_an_object_is_in_a_sliding_part_of_a_recorded_description(log: Eve
     tidying.script.put(JointsMoved(tidying.reference("chest"), {"slide": 0.6}))
     inside = tidying.pick_up("cup")
     assert await relations(log, tidying, declared_) == {inside: {("in", "chest", "tray")}}
-
-
-async def test_the_links_of_a_recorded_kitchen_are_those_of_the_built_in_one(log: EventLog) -> None:
-    declared_ = Declared()
-    kitchen = declared_.description(built_in_model("kitchen"))
-    event = decode("DescriptionDeclared", declared_.records[0].payload)
-    assert isinstance(event, DescriptionDeclared)
-    recorded = {each.link: each for each in event.link_boxes}
-    assert recorded.keys() == {each.link for each in link_boxes(built_in_model("kitchen"))}
-    for each in link_boxes(built_in_model("kitchen")):
-        box = recorded[each.link]
-        assert (box.joint, box.axis) == (each.joint, each.axis)
-        assert [*box.center, *box.half] == pytest.approx([*each.center, *each.half], abs=1e-5)
-    tidying = Tidying()
-    tidying.script.put(ObjectRemoved(tidying.reference("kitchen")))
-    tidying.add("home", "ENVIRONMENT", 0, 0, 0, description=kitchen)
-    tidying.add("milk", "MILK", 1.3, 1.0, 0.9)
-    picked = tidying.pick_up("milk")
-    assert await relations(log, tidying, declared_) == {picked: {("on", "home", "sink_area_surface")}}
-
-
-def test_the_boxes_of_the_kitchen_are_those_of_its_links() -> None:
-    boxes = {each.link: each for each in link_boxes(built_in_model("kitchen"))}
-    surface, drawer = boxes["kitchen_counter_surface"], boxes["kitchen_island_upper_drawer"]
-    assert (surface.center, surface.half) == ((1.35, 0.15, 0.828), (0.3, 0.7, 0.02))
-    assert (drawer.center, drawer.half) == ((-1.315, 1.0, 0.74), (0.235, 0.3, 0.1))
-    assert (drawer.joint, drawer.axis) == ("kitchen_island_upper_drawer_joint", (1.0, 0.0, 0.0))
-    assert "fridge_door" not in boxes
 
 
 async def boxes_by_model(log: EventLog, generation: int = 1001) -> dict[str, int]:

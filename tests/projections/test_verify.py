@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory
-from pycrorm_async.events.types import EpisodeEnded, NodeStarted
 from pycrorm_async.projections import verify as parts
 from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.projector import Projector
@@ -18,7 +17,6 @@ from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change, change_each
 from tests.projections.event_script import Script
 from tests.projections.verify_cases import (
-    TYPES,
     PreparedMemory,
     another,
     assert_clean,
@@ -112,36 +110,6 @@ async def test_unfolded_events_are_no_fault(log: EventLog, database_url: str) ->
     assert (await look(log, episode=3)).rows == sum(
         event_of(table, row)[0] == 3 for table in visible_tables(database_url) for row in rows_of(database_url, table)
     )
-
-
-async def test_a_fold_between_two_parts_is_no_fault(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = await opened(database_url)
-    scripts = [full(1, rounds=2), lost(2), full(3, simulated=True)]
-    await fold_in_batches(log, [], 1)
-    await log.append([*TYPES, *(each for script in scripts for each in script.records)])
-    monkeypatch.setattr(parts, "_PART_EVENTS", 25)
-    looks = 0
-
-    async def fold() -> None:
-        other = await opened(database_url)
-        projector = Projector(other, batch_events=6)
-        await projector.open()
-        await projector.fold_next_batch()
-        await other.close()
-
-    while (await log.behind()) and looks < 50:
-        # Fold some events during the first parts of each look, so that the tables are behind what is read, or ahead of
-        # it.
-        left = iter([*range(3)])
-        assert_clean(
-            await verify(
-                log, report_progress=lambda *_, left=left: in_own_loop(fold) if next(left, None) is not None else None
-            )
-        )
-        looks += 1
-    assert looks > 1
-    assert_clean(await look(log))
-    await log.close()
 
 
 async def test_a_rebuild_between_two_parts_is_no_fault(
@@ -258,34 +226,3 @@ async def test_a_row_without_an_event_is_reported_in_every_table(
     if number in (1, 6):
         assert (await look(log, episode=number)).drift == len(expected)
     assert (await look(log, episode=7)).drift == 0
-
-
-async def test_an_episode_read_in_many_parts_has_the_same_findings_as_in_one(
-    database_url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = await opened(database_url)
-    await fold_in_batches(log, [full(1), lost(2), full(3, simulated=True)], 10_000)
-    for place, table in enumerate(visible_tables(database_url)):
-        rows = rows_of(database_url, table)
-        if table.name == "simulated_episode" or not rows:
-            continue
-        delete(database_url, table, rows[place % len(rows)])
-        changed = rows[(place + 1) % len(rows)]
-        column = next(each for each in table.columns[1:] if each not in table.key)
-        set_columns(database_url, table, changed, {column: another(changed[column], table.kinds[column])})
-    result = await look(log)
-    assert 20 < result.drift < 100
-    assert findings(await in_parts(log, 7, monkeypatch)) == findings(result)
-    await log.close()
-
-
-async def test_a_lost_end_is_reported_in_the_tables_and_in_the_log(log: EventLog) -> None:
-    script = Script(8)
-    script.put(NodeStarted("root"))
-    script.put(EpisodeEnded("SUCCEEDED"))
-    await log.append(script.records)
-    result = await look(log)
-    assert [str(each) for each in result.damages] == [
-        "episode 8, event 1: the episode has not started",
-        "episode 8, event 2: the episode has not started",
-    ]

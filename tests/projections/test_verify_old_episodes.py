@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.fields import checked_tags
 from tests.commands import answer, pycrorm
 from tests.golden.unpacking import unpack_memory
 from tests.golden.zoo import ZOO
@@ -60,8 +59,3 @@ def test_where_an_episode_without_a_digest_differs_no_rebuild_is_recommended(dat
     assert "the tables of 1 episode without a digest differ from the log" in last
     assert "the log is intact" not in done.stdout
     assert answer("verify", "--url", f"sqlite:///{database}", cwd=tmp_path, code=1)["undecided"] == 1
-
-
-def test_a_tag_is_recorded_as_other_texts_are() -> None:
-    tags = ["a\x00b", "a\udc80", "tab\t", "esc\x1b", "kitchen"]
-    assert checked_tags(tags) == ("a\\x00b", "a\\udc80", "tab\t", "esc\x1b", "kitchen")

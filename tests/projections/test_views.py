@@ -351,24 +351,6 @@ async def test_a_changed_query_under_the_same_name_is_shown_and_the_next_rebuild
     assert len(await kept_tables_of(log)) == 2
 
 
-@pytest.mark.soak_on("postgresql")
-@pytest.mark.soak_on("sqlite")
-async def test_a_rebuild_makes_it_again_and_it_is_kept_up_to_date(log: EventLog) -> None:
-    projector = Projector(log, views=[KEPT, PLAIN])
-    await projector.open()
-    await log.append([*declarations(SAYING), *mixed(talk(1, 4), talk(2, 7))])
-    await projector.catch_up()
-    before = await visible_rows(log, "said")
-    old = set(await kept_tables_of(log))
-    await rebuild_memory(log.address.to_type)
-    assert await visible_rows(log, "said") == before
-    assert old.isdisjoint(await kept_tables_of(log))
-    await log.append(talk(3, 2).records)
-    await projector.catch_up()
-    assert await visible_rows(log, "said") == await visible_rows(log, "said_plainly")
-    assert len(await visible_rows(log, "said")) == 13
-
-
 async def test_one_whose_rows_name_no_episode_is_refused(log: EventLog) -> None:
     nameless = UserView("said", select(TaskTreeNode.id), materialised=True)
     with pytest.raises(CallerError, match=r"said cannot be materialised: .* \(select process_metadata_id\)"):

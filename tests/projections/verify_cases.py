@@ -38,6 +38,7 @@ from pycrorm_async.events.types import (
     StateSampled,
 )
 from pycrorm_async.projections import verify as parts
+from pycrorm_async.projections.custom import Projection
 from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
@@ -205,13 +206,11 @@ def in_own_loop(call: Callable[[], Awaitable[None]]) -> None:
         raise faults[0]
 
 
-async def rebuilt(log: EventLog) -> None:
+async def rebuilt(log: EventLog, projection: Projection | None = None) -> None:
     async with claimed(log):
-        rebuild = await Rebuild.begin(log)
-        while await rebuild.fold_next_batch() is not None:
-            pass
+        rebuild = await Rebuild.begin(log, projection=projection)
         await rebuild.show()
-        await clear(log)
+        assert await clear(log) == []
 
 
 async def opened(url: str) -> EventLog:

@@ -159,6 +159,15 @@ async def test_declarations_are_stored_once_in_the_order_of_their_first_arrival(
     ]
 
 
+async def test_designator_types_are_read_without_the_descriptions(log: EventLog) -> None:
+    description = declaration(b'{"urdf":"e30="}')._replace(type="DescriptionDeclared")
+    name = fingerprint(description.payload, "DescriptionDeclared")
+    await log.append([description, declaration(b'{"dtype":"A"}')])
+    assert await log.declarations() == [b'{"dtype":"A"}']
+    assert await log.descriptions([name, "urdf-missing"]) == {name: description.payload}
+    assert await log.descriptions([]) == {}
+
+
 async def test_declarations_are_committed_in_the_order_in_which_they_are_read(log: EventLog) -> None:
     if log.address.is_sqlite:
         return  # one transaction writes at a time

@@ -9,7 +9,6 @@ from pathlib import Path
 import msgspec
 import pytest
 from sqlalchemy import text
-from sqlalchemy.exc import DBAPIError
 
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.types import Blob, BlobReference
@@ -117,12 +116,3 @@ async def test_a_blob_with_other_bytes_and_an_incomplete_one_are_faults(
             {"name": "2" * 64, "of": NAME},
         )
     assert await log.blobs.fault("2" * 64) == "is incomplete: 1 of 2 parts are stored"
-
-
-async def test_a_stored_blob_cannot_be_changed_or_deleted(log: EventLog) -> None:
-    log.blobs.source = Files(log, CONTENT)
-    await log.append([observed(1, CONTENT)])
-    for change in ("UPDATE pycrorm_blob SET size = 1", "DELETE FROM pycrorm_blob"):
-        with pytest.raises(DBAPIError, match="append-only"):
-            async with log.writing() as connection:
-                await connection.execute(text(change))

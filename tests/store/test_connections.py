@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import aiosqlite
 import pytest
-from sqlalchemy import select, text
+from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.orm import Pose
 from pycrorm_async.projections.custom import own_projections
-from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -200,31 +197,6 @@ async def test_a_reading_transaction_begins_with_its_first_statement_and_sees_on
     await connection.close()
 
 
-async def test_a_rollback_takes_no_visit_to_the_thread_unless_that_is_busy(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    visits: list[Any] = []
-    visit = aiosqlite.Connection._execute
-
-    async def count(connection: Any, work: Any, *arguments: Any, **named: Any) -> Any:
-        visits.append(work)
-        return await visit(connection, work, *arguments, **named)  # type: ignore[no-untyped-call]
-
-    monkeypatch.setattr(aiosqlite.Connection, "_execute", count)
-    connection = await _connect(f"{file.as_uri()}?mode=rw", 1.0)
-    for is_busy in (False, True):
-        await connection.execute_in_turn([("BEGIN", ()), ("CREATE TABLE node (id)", ())])
-        visits.clear()
-        work = asyncio.create_task(connection.visit(lambda _: time.sleep(0.05))) if is_busy else None
-        await asyncio.sleep(0)
-        await connection.rollback()
-        assert len(visits) == 2 * is_busy  # the sleep, and the rollback behind it
-        if work is not None:
-            await work
-        assert not connection.in_transaction
-    await connection.close()
-
-
 # === slow network =============================================================================================
 #
 # A memory on a server behind a connection that is slow, or breaks.
@@ -249,21 +221,6 @@ async def test_making_a_memory_takes_far_fewer_messages_than_it_has_tables(serve
     [[statements]] = ask(url, MADE)
     assert statements > 200
     assert proxy.requests < statements / 2  # each message takes the delay of the line in both directions
-
-
-@pytest.mark.slow
-async def test_a_connection_that_breaks_while_replaced_views_are_dropped_is_reported_as_such(server: Server) -> None:
-    url = server.new_database()
-    async with proxy_before(server.folder) as proxy:
-        log = await opened(proxy, url)
-        await Projector(log).open()
-        proxy.cut_before(b"DROP SCHEMA")
-        with pytest.raises(DatabaseUnavailable):
-            await Projector(log, views=[UserView("heights", select(Pose.z))]).open()
-        assert proxy.faults == 1
-        await Projector(log, views=[UserView("heights", select(Pose.z))]).open()
-        await log.close()
-    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname LIKE 'memory%'") == [(2,)]
 
 
 @pytest.mark.slow

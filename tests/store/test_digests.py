@@ -77,14 +77,6 @@ async def test_each_block_the_end_and_each_tag_behind_it_have_a_digest_whatever_
     assert [sequence for sequence, _ in rows] == [256, 512, 600, 601, 602]
 
 
-async def test_repeats_and_the_position_make_no_difference(log: EventLog, database_url: str) -> None:
-    records = whole(episode(1), 300)
-    await log.append(records[:200])
-    await log.append([each._replace(position=0) for each in records[100:]])
-    await log.append(records)
-    assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
-
-
 @pytest.mark.parametrize("at", [255, 256, 400])
 async def test_a_restarted_writer_and_another_process_continue_from_the_log(file_log: EventLog, at: int) -> None:
     records = whole(episode(1), 600)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
-import subprocess
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +12,6 @@ from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.sqlite_engine import translate_error
 from pycrorm_async.writer.drain import Backoff, Drain
@@ -25,46 +21,19 @@ from tests.writer.fakes import KeptSource
 
 
 class SmallDisk:
-    """A disk of 2 MiB; where the machine permits no mount, a limit on SQLite's pages replaces it."""
+    """A limit on SQLite's pages, which fails as a full disk does."""
 
-    def __init__(self, place: Path) -> None:
-        self.place = place
-        self._mounted = self._mount("size=2m") == 0
+    def __init__(self, engine: AsyncEngine) -> None:
         self._pages = 256
-
-    def fill(self) -> None:
-        if self._mounted:
-            (self.place / "ballast").write_bytes(bytes(2**20))
-
-    def limit(self, engine: AsyncEngine) -> None:
-        if not self._mounted:
-            event.listen(engine.sync_engine, "checkout", self._limit_pages)
+        event.listen(engine.sync_engine, "checkout", self._limit_pages)
 
     def free_space(self) -> None:
         self._pages = 2**20
-        if self._mounted:
-            (self.place / "ballast").unlink()
-            assert self._mount("remount,size=8m") == 0
-
-    def release(self) -> None:
-        if self._mounted:
-            subprocess.run(["umount", str(self.place)], check=True)
-
-    def _mount(self, options: str) -> int:
-        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(self.place)]
-        return subprocess.run(command, capture_output=True, check=False).returncode
 
     def _limit_pages(self, connection: Any, *_: object) -> None:
         cursor = connection.cursor()
         cursor.execute(f"PRAGMA max_page_count = {self._pages}")
         cursor.close()
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[SmallDisk]:
-    disk = SmallDisk(tmp_path)
-    yield disk
-    disk.release()
 
 
 @pytest.mark.parametrize("code", [sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_WRITE])
@@ -77,13 +46,11 @@ def test_a_disk_without_room_for_the_files_of_sqlite_is_named_as_the_cause(code:
 
 
 async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_once_when_there_is_space(
-    small_disk: SmallDisk,
+    file_log: EventLog,
 ) -> None:
-    small_disk.fill()
-    file = small_disk.place / "memory.db"
+    log, file = file_log, file_log.address.path
     records = [record(episode(1), sequence, payload=b'"%s"' % (b"x" * 1000)) for sequence in range(1, 1001)]
-    log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{file}"), create=True)
-    small_disk.limit(log.engine)
+    disk = SmallDisk(log.engine)
     source = KeptSource(records, closed=True)
     backoff = Backoff(first_s=0.005, longest_s=0.02)
     drain = Drain(source, log.append, settings=Settings(batch_events_max=50), backoff=backoff)
@@ -94,9 +61,8 @@ async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_on
     assert 0 < len(source.kept) < 1000
     with pytest.raises(DatabaseUnavailable, match="full"):
         await log.append(records)
-    await asyncio.to_thread(small_disk.free_space)
+    disk.free_space()
     await asyncio.wait_for(running, 60)
-    await log.close()
     assert source.kept == []
     assert ask(file, "SELECT count(*), min(sequence), max(sequence) FROM event") == [(1000, 1, 1000)]
     assert ask(file, "PRAGMA integrity_check") == [("ok",)]

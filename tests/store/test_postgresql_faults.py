@@ -132,13 +132,13 @@ FAULTS: dict[str, Callable[[Proxy], None]] = {
 @pytest.mark.soak_on("reset", "cut before COPY", "reply to COPY lost")
 @pytest.mark.parametrize("fault", FAULTS)
 async def test_a_connection_that_fails_repeatedly_costs_no_event(fault: str, proxy: Proxy, direct_url: str) -> None:
-    records = records_of_three_episodes(random.Random(7), 3000)
+    records = records_of_three_episodes(random.Random(7), 1500)
     happened = 0
 
     async def again_and_again(drain: Drain) -> None:
         nonlocal happened
         rng = random.Random(11)
-        while drain.state.appended < len(records) and happened < 12:
+        while drain.state.appended < len(records) and happened < 6:
             before, seen = drain.state.retries, proxy.faults
             FAULTS[fault](proxy)
             while drain.state.retries == before and drain.state.appended < len(records):

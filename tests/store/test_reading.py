@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 from sqlalchemy import text
@@ -121,20 +119,6 @@ async def test_events_are_read_even_if_together_they_exceed_the_limit_of_one_val
         assert await dialect_of(file_log.engine).spans(connection, [Span(1, 2, 9)]) == whole
 
 
-async def test_a_reader_sees_committed_events_while_another_process_writes(file_log: EventLog) -> None:
-    await file_log.append(run_of(episode(1), 1, 3))
-    reading = await EventLog.open(file_log.address, create=False)
-    writer = sqlite3.connect(file_log.address.path, isolation_level=None)
-    writer.execute("BEGIN IMMEDIATE")
-    writer.execute("UPDATE episode SET folded = 1")
-    assert [row.folded for row in await reading.episodes()] == [0]
-    assert [row.folded for row in await file_log.episodes()] == [0]  # reading does not wait for the write lock either
-    writer.execute("COMMIT")
-    writer.close()
-    assert [row.folded for row in await reading.episodes()] == [1]
-    await reading.close()
-
-
 async def test_streamed_rows_are_whole_and_in_order(file_log: EventLog) -> None:
     await file_log.append(run_of(episode(1), 1, 200))
     query = text("SELECT sequence FROM event ORDER BY sequence")
@@ -146,28 +130,6 @@ async def test_streamed_rows_are_whole_and_in_order(file_log: EventLog) -> None:
         assert [row[0] for row in await streamed.fetchmany(70)] == list(range(1, 71))
         assert (await streamed.fetchone()) == (71,)
         await streamed.close()
-
-
-@pytest.mark.parametrize(("rows", "visits"), [(0, 1), (64, 2), (200, 3)])
-async def test_rows_fetched_one_by_one_take_few_visits_to_the_thread(
-    file_log: EventLog, monkeypatch: pytest.MonkeyPatch, rows: int, visits: int
-) -> None:
-    await file_log.append(run_of(episode(1), 1, 200))
-    visited: list[object] = []
-    visit = StoppableConnection.visit
-
-    async def counted_visit(connection: StoppableConnection, work: Callable[[sqlite3.Connection], Any]) -> Any:
-        visited.append(work)
-        return await visit(connection, work)
-
-    async with file_log.reading() as connection:
-        monkeypatch.setattr(StoppableConnection, "visit", counted_visit)
-        streamed = await connection.stream(text(f"SELECT sequence FROM event ORDER BY sequence LIMIT {rows}"))
-        fetched = []
-        while (row := await streamed.fetchone()) is not None:
-            fetched.append(row.sequence)
-    assert fetched == list(range(1, rows + 1))
-    assert len(visited) == visits
 
 
 # === computed end =============================================================================================

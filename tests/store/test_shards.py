@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 SHARDED = "SELECT episode, sequence FROM pycrorm_shard.event ORDER BY 1, 2"
 STORED = """SELECT episode.id, count(event.*), max(head), count(DISTINCT sequence) FROM pycrorm.episode
 LEFT JOIN pycrorm.event ON episode.number = event.episode GROUP BY 1"""
-ROUNDS = int(os.environ.get("PYCRORM_TEST_KILLS", "3"))
+ROUNDS = int(os.environ.get("PYCRORM_TEST_KILLS", "2"))
 
 
 @pytest.fixture(scope="module")

@@ -1,32 +1,25 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress, private_folder
-
-HOLD_ONE = """
-import sys
-from pathlib import Path
-from pycrorm_async.store.address import private_folder
-with private_folder(Path(sys.argv[1])) as folder:
-    print(folder, flush=True)
-    sys.stdin.read()
-"""
+from tests.crash.forked_processes import ForkedProcess
 
 
-def held_by_another_process(place: Path) -> tuple[subprocess.Popen[str], Path]:
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLD_ONE, str(place)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    return process, Path(process.stdout.readline().strip())
+def _hold_one(place: str) -> None:
+    with private_folder(Path(place)) as folder:
+        print(folder, flush=True)
+        os.read(0, 1)
+
+
+def held_by_another_process(place: Path) -> tuple[ForkedProcess, Path]:
+    process = ForkedProcess(_hold_one, str(place))
+    process.wait_for("\n")
+    return process, Path(process.lines[0])
 
 
 def test_a_temporary_database_has_a_folder_only_while_it_is_used() -> None:
@@ -53,14 +46,14 @@ def test_an_address_with_a_path_is_used_as_it_is(tmp_path: Path) -> None:
 def test_the_folder_of_a_killed_process_is_deleted_and_that_of_a_live_one_is_not(tmp_path: Path) -> None:
     killed, left_behind = held_by_another_process(tmp_path)
     living, in_use = held_by_another_process(tmp_path)
-    killed.send_signal(signal.SIGKILL)
-    killed.communicate()
+    killed.kill()
     assert left_behind.is_dir()
     with private_folder(tmp_path) as mine:
         assert not left_behind.exists()
         assert in_use.is_dir()
         assert mine.is_dir()
-    living.communicate()
+    living.send_byte()
+    assert living.wait() == 0
     assert not in_use.exists()
 
 
@@ -80,34 +73,28 @@ def test_files_with_matching_names_neither_delay_it_nor_are_touched(tmp_path: Pa
 
 @pytest.mark.slow
 def test_many_processes_that_make_and_delete_concurrently_each_have_a_folder(tmp_path: Path) -> None:
-    script = """
-import sys
-from pathlib import Path
-from pycrorm_async.store.address import private_folder
-for _ in range(200):
-    with private_folder(Path(sys.argv[1])) as folder:
-        (folder / "memory.db").touch(exist_ok=False)
-"""
-    command = [sys.executable, "-c", script, str(tmp_path)]
-    running = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
-    assert [each.communicate()[1] for each in running] == [""] * 4
+    running = [ForkedProcess(_make_and_delete, str(tmp_path)) for _ in range(4)]
+    assert [each.wait() for each in running] == [0] * 4
     assert list(tmp_path.iterdir()) == []
 
 
+def _make_and_delete(place: str) -> None:
+    for _ in range(200):
+        with private_folder(Path(place)) as folder:
+            (folder / "memory.db").touch(exist_ok=False)
+
+
 def test_a_forked_child_that_leaves_the_context_keeps_its_parents_folder(tmp_path: Path) -> None:
-    script = """
-import os, sys
-from pathlib import Path
-from pycrorm_async.store.address import private_folder
-with private_folder(Path(sys.argv[1])) as folder:
-    child = os.fork()
-    if child:
-        os.waitpid(child, 0)
-        print("still there" if folder.is_dir() else "gone", flush=True)
-"""
-    ran = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=True)
-    assert ran.stdout == "still there\n"
+    parent = ForkedProcess(_fork_inside, str(tmp_path))
+    assert (parent.wait(), parent.lines) == (0, ["True"])
     assert list(tmp_path.glob("*/")) == []
+
+
+def _fork_inside(place: str) -> None:
+    with private_folder(Path(place)) as folder:
+        if child := os.fork():
+            os.waitpid(child, 0)
+            print(folder.is_dir(), flush=True)
 
 
 def test_a_missing_place_is_an_unavailable_database(tmp_path: Path) -> None:
