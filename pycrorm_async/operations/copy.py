@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -38,7 +38,7 @@ from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
 from pycrorm_async.events.types import EVENT_TYPES, EpisodeTagged
 from pycrorm_async.operations.destination import LogAndTables
-from pycrorm_async.operations.workers import Assignment, ChildProcess, FoldWorkers, FoldWorkerTables
+from pycrorm_async.operations.workers import Assignment, ChildProcess, FoldWorkers, WorkerFolds
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
@@ -47,7 +47,7 @@ from pycrorm_async.store.lake import PREFIX, Lake
 from pycrorm_async.store.log import EventLog, episode_named, tags_of
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
-from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, TablesPort, retry
+from pycrorm_async.writer.drain import BATCH_BYTES_MAX, BRIEF, retry
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
@@ -126,8 +126,8 @@ async def copy_episodes(
             async with FoldWorkers(
                 len(forked), assignment, settings=settings, report=_log.warning, note=lambda _: None, forked=forked
             ) as workers:
-                tables = FoldWorkerTables(destination, workers) if forked else destination
-                copier = _Copier(log, target_log, destination, tables, settings, report_progress)
+                folds = WorkerFolds(destination, workers) if forked else destination
+                copier = _Copier(log, target_log, destination, folds.fold_next_batch, settings, report_progress)
                 done = await copier.copy(rows)
     finally:
         await log.close()
@@ -199,14 +199,14 @@ class _Copier:
         source: Source,
         target: EventLog,
         destination: LogAndTables,
-        tables: TablesPort,
+        fold_next_batch: Callable[[], Awaitable[bool]],
         settings: Settings,
         report_progress: ProgressCallback,
     ) -> None:
         self._source = source
         self._target = target
         self._destination = destination
-        self._tables = tables
+        self._fold_next_batch = fold_next_batch
         self._appended = asyncio.Event()
         self._is_last = False
         self._settings = settings
@@ -346,8 +346,8 @@ class _Copier:
             await self._appended.wait()
             self._appended.clear()
             is_last = self._is_last
-            while episodes & (await self._tables.behind()).keys():
-                await retry(self._tables.fold_next_batch, backoff=BRIEF)
+            while episodes & (await self._destination.behind()).keys():
+                await retry(self._fold_next_batch, backoff=BRIEF)
 
     async def _append_at_once(self, records: Sequence[Record]) -> None:
         refusals = await retry(partial(self._destination.append, records), backoff=BRIEF)

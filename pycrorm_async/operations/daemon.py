@@ -14,6 +14,7 @@ daemon stops, because it would keep writing to the old file, which no longer has
 """
 
 import asyncio
+import functools
 import os
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -33,10 +34,10 @@ from pycrorm_async.operations.workers import (
     DaemonNote,
     FoldWorkers,
     FoldWorkerState,
-    FoldWorkerTables,
+    WorkerFolds,
 )
 from pycrorm_async.projections.custom import Projection, validate_projections
-from pycrorm_async.queue.locks import FileIdentity, FileLock
+from pycrorm_async.queue.locks import FileIdentity
 from pycrorm_async.queue.sources import LiveSource, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool, folder_error
 from pycrorm_async.queue.stored_segments import StoredSegments
@@ -44,7 +45,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress, shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
-from pycrorm_async.writer.drain import ClaimedSource, ScanResult, TablesPort
+from pycrorm_async.writer.drain import ClaimedSource, ScanResult
 
 _SCAN_S_MAX: Final = 1.0
 """The time after which a spool is scanned although it has not changed: its file system may not note every change."""
@@ -79,7 +80,15 @@ async def serve(
     lock = place.take_writer()
     if lock is None:
         raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
-    note = _Note(lock, report)
+    report_once = functools.cache(report)
+
+    def note(workers: Sequence[FoldWorkerState]) -> None:
+        """Write the states of the fold workers into the lock file, where `pycrorm status` reads them."""
+        try:
+            lock.write_note(msgspec.json.encode(DaemonNote(os.getpid(), workers)))
+        except OSError as error:
+            report_once(f"`pycrorm status` cannot show the fold workers: their states cannot be written: {error}")
+
     async with AsyncExitStack() as stack:
         stack.callback(lock.release)
         projections = validate_projections(projections)
@@ -94,25 +103,9 @@ async def serve(
         workers = await stack.enter_async_context(
             FoldWorkers(fold_workers, assignment, settings=settings, report=report, note=note, forked=forked)
         )
-        tables: TablesPort = FoldWorkerTables(destination, workers) if fold_workers else destination
-        return await Daemon(destination, tables, folders, settings=settings, report=report).run(stop)
-
-
-class _Note:
-    """Writes the states of the fold workers into the daemon's lock file, where `pycrorm status` reads them."""
-
-    def __init__(self, lock: FileLock, report: Callable[[str], None]) -> None:
-        self._lock = lock
-        self._report = report
-        self._failed = False
-
-    def __call__(self, workers: Sequence[FoldWorkerState]) -> None:
-        try:
-            self._lock.write_note(msgspec.json.encode(DaemonNote(os.getpid(), workers)))
-        except OSError as error:
-            if not self._failed:
-                self._report(f"`pycrorm status` cannot show the fold workers: their states cannot be written: {error}")
-            self._failed = True
+        fold_next_batch = WorkerFolds(destination, workers).fold_next_batch if fold_workers else None
+        daemon = Daemon(destination, folders, settings=settings, report=report, fold_next_batch=fold_next_batch)
+        return await daemon.run(stop)
 
 
 class Folders:
@@ -158,7 +151,8 @@ class Folders:
         began_s, changed_ns = time.monotonic(), _changed_ns(self._spool.path)
         present = self._spool.recorders()
         self._taken &= {each.name for each in present}
-        folders = [each for each in present if each.name not in but and self._is_ours(each)]
+        ours = [each for each in present if self._recorder in (None, each.name) or not each.alive]
+        folders = [each for each in ours if each.name not in but]
         if folders:  # a spool that contains a folder cannot be bound to another log any more
             self._spool.bind(self._log_id)
         for folder in folders:
@@ -173,9 +167,6 @@ class Folders:
         names = {*but, *(each.name for each in claimed)}
         self._scanned = began_s, changed_ns if len(claimed) == len(folders) else None, names
         return ScanResult(claimed, failed)
-
-    def _is_ours(self, folder: RecorderFolder) -> bool:
-        return self._recorder in (None, folder.name) or not folder.alive
 
     def _claim(self, folder: RecorderFolder) -> ClaimedSource | None:
         """Claim a folder as that of a living or a dead recorder; None if another process has it."""

@@ -69,7 +69,7 @@ _HEALINGS_MAX: Final = 3
 
 
 class LogAndTables:
-    """The log and the tables folded from it. Implements the writer's `Log`, `Destination` and `Tables`.
+    """The log and the tables folded from it. Implements the writer's `StepwiseDestination`.
 
     While this process cannot use the tables, it appends events and folding raises `TablesForeign`. With a spool, the
     events in its segments are appended again to a log that lost them.

@@ -173,8 +173,10 @@ async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, report_pro
         idle = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
         workers = 2 if idle >= _IDLE_CORES_MIN and left > _ALONE_EVENTS_MAX else 1
     workers = min(workers, episodes, left // _SHARE_EVENTS_MIN)
-    while workers > 1 and await _smallest_share(rebuild, workers) < _SHARE_EVENTS_MIN:  # of one long episode and others
-        workers -= 1
+    while workers > 1:
+        if min([await rebuild.left(Share(part, workers)) for part in range(workers)]) >= _SHARE_EVENTS_MIN:
+            break
+        workers -= 1  # one long episode leaves too little for the others
     done = total - left
 
     def report(count: int) -> None:
@@ -192,10 +194,6 @@ async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, report_pro
     # fault is raised here, in the process that reports it.
     while (count := await rebuild.fold_next_batch()) is not None:
         report(count)
-
-
-async def _smallest_share(rebuild: Rebuild, count: int) -> int:
-    return min([await rebuild.left(Share(part, count)) for part in range(count)])
 
 
 async def _run_workers(assignment: Assignment, count: int, report: Callable[[int], None]) -> None:

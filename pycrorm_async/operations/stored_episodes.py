@@ -4,9 +4,9 @@ A recording has no event loop of its own and may be called inside one, so each q
 """
 
 import asyncio
-import threading
 import time
 from collections.abc import Collection, Coroutine, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -114,18 +114,5 @@ def _holds(folder: Path, episode: EpisodeId) -> bool:
 
 def _run(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine in a loop and a thread of its own, and return its result."""
-    results: list[T] = []
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            results.append(asyncio.run(coroutine))
-        except BaseException as error:  # noqa: BLE001  raised in the caller's thread
-            errors.append(error)
-
-    thread = threading.Thread(target=run, name="pycrorm stored episodes")
-    thread.start()
-    thread.join()
-    for error in errors:
-        raise error
-    return results[0]
+    with ThreadPoolExecutor(1, "pycrorm stored episodes") as thread:
+        return thread.submit(asyncio.run, coroutine).result()

@@ -24,7 +24,7 @@ this process. The fork server reaps its children itself, so `kill` first looks w
 **Fold workers.** Start the fold workers of a daemon, which fold while it appends, or those of a rebuild.
 
     async with FoldWorkers(2, assignment, settings=settings, report=report, note=note) as workers:
-        tables = FoldWorkerTables(destination, workers)
+        folds = WorkerFolds(destination, workers)
 
 Theory of operation. A worker is a process with one connection to its parent, a daemon or a rebuild. The
 parent sends a request and waits for the answer; between requests a worker has no lock and no transaction. Checkpoints
@@ -42,7 +42,7 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from multiprocessing import resource_tracker
@@ -65,7 +65,7 @@ from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress, shared_
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
-from pycrorm_async.writer.drain import Backoff, TablesPort
+from pycrorm_async.writer.drain import Backoff
 
 #
 # Run one fold worker: start its process, restart it when it dies, and exchange requests with it.
@@ -447,12 +447,12 @@ class ChildProcess(NamedTuple):
 
     async def receive(self) -> Any:
         """Return the next message. Raises `EOFError` or `OSError` when the process ends."""
-        await _readable(self.connection.fileno())
+        await readable(self.connection.fileno())
         return self.connection.recv()
 
     async def ended(self) -> int:
         """Wait for the end of the process; return its exit code, which is negative for a signal."""
-        await _readable(self.process.sentinel)
+        await readable(self.process.sentinel)
         self.process.join()
         assert self.process.exitcode is not None
         return self.process.exitcode
@@ -469,7 +469,7 @@ class ChildProcess(NamedTuple):
         self.connection.close()
 
 
-async def _readable(descriptor: int) -> None:
+async def readable(descriptor: int) -> None:
     """Wait until a file descriptor can be read, or has come to its end."""
     readable = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -609,8 +609,8 @@ def _import_drivers(url: str) -> None:
     import_module("sqlalchemy.dialects.postgresql")  # an index of the tables has an option of it, also on SQLite
 
 
-class FoldWorkerTables(TablesPort):
-    """Folds a destination's tables with workers, or in this process while no worker is ready. Implements `Tables`."""
+class WorkerFolds:
+    """Folds a destination's tables with workers, or in this process while no worker is ready."""
 
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:
         self._destination = destination
@@ -619,14 +619,8 @@ class FoldWorkerTables(TablesPort):
         self._runner = FoldRunner(self._target)
         self._rest_until_s = 0.0
 
-    @property
-    def has_other_writers(self) -> bool:
-        return self._destination.has_other_writers
-
-    async def has_unfolded(self) -> bool:
-        return await self._destination.has_unfolded()
-
     async def fold_next_batch(self) -> bool:
+        """Implement `StepwiseDestination.fold_next_batch`."""
         async with self._destination.group.folding() as share:
             self._target.share = share
             if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
@@ -650,9 +644,3 @@ class FoldWorkerTables(TablesPort):
             return count is not None or await workers[0].fold_rest(share)
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
-
-    async def behind(self) -> Mapping[str, int]:
-        return await self._destination.behind()
-
-    async def stopped(self) -> Mapping[str, str]:
-        return await self._destination.stopped()

@@ -42,12 +42,13 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations.daemon import Folders
 from pycrorm_async.operations.destination import open_destination
+from pycrorm_async.operations.workers import readable
 from pycrorm_async.queue.locks import ALIVE, call_in_forked_child, is_locked
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.writer.daemon import STOP_S, Daemon
+from pycrorm_async.writer.daemon import STOP_S, Daemon, one_line
 from pycrorm_async.writer.drain import Backoff
 
 _RESTARTS: Final = Backoff(first_s=0.1, longest_s=60.0)
@@ -249,8 +250,7 @@ def main() -> None:
     except BaseException as error:  # noqa: BLE001 - the owner logs it, and starts another process
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
-        text = " ".join(str(error).split())
-        owner.send(f"ended: {text if isinstance(error, PycrormError) else f'{type(error).__name__}: {text}'}")
+        owner.send(f"ended: {one_line(error)}")
         os._exit(1)
     os._exit(0)
 
@@ -275,18 +275,15 @@ class _Owner(logging.Handler):
 
     async def ended(self, folder: Path) -> None:
         """Return when the owner has closed its queue or is dead."""
-        loop, readable = asyncio.get_running_loop(), asyncio.Event()
-        loop.add_reader(self.connection.fileno(), readable.set)
-        try:
-            while not readable.is_set() and is_locked(folder / ALIVE):
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(_LOOK_S):
-                        await readable.wait()
-            if readable.is_set():
-                with suppress(EOFError, OSError):
-                    self.has_closed = self.connection.recv() == _CLOSED
-        finally:
-            loop.remove_reader(self.connection.fileno())
+        while is_locked(folder / ALIVE):
+            try:
+                async with asyncio.timeout(_LOOK_S):
+                    await readable(self.connection.fileno())
+            except TimeoutError:
+                continue
+            with suppress(EOFError, OSError):
+                self.has_closed = self.connection.recv() == _CLOSED
+            return
 
 
 async def _serve(assignment: WriterAssignment, owner: _Owner) -> None:
@@ -310,7 +307,7 @@ async def _serve(assignment: WriterAssignment, owner: _Owner) -> None:
 
         async with asyncio.TaskGroup() as tasks:
             waiting = tasks.create_task(stop_when_over(), name="pycrorm owner")
-            await Daemon(destination, destination, folders, settings=settings, report=owner.report).run(stop)
+            await Daemon(destination, folders, settings=settings, report=owner.report).run(stop)
             waiting.cancel()
         # The daemon stops when the tables show everything: custom projections and views may be behind them.
         with suppress(PycrormError, TimeoutError):

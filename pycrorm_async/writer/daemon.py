@@ -58,21 +58,25 @@ class DaemonSummary(NamedTuple):
 
 
 class Daemon:
-    """The daemon. Belongs to the loop that runs it. `report` gets one line per notable event."""
+    """The daemon. Belongs to the loop that runs it. `report` gets one line per notable event.
+
+    Folds with `fold_next_batch` of the destination, or of another object that has processes for that.
+    """
 
     def __init__(
         self,
-        log: drain.Log,
-        tables: drain.TablesPort,
+        destination: drain.StepwiseDestination,
         scan: drain.SourceScanner,
         *,
         settings: Settings,
         report: Callable[[str], None],
+        fold_next_batch: Callable[[], Awaitable[bool]] | None = None,
         randomness: Callable[[], float] = random.random,
     ) -> None:
-        self._log = log
-        self._tables = tables
-        self._availability = Availability(now_s=self._now_s, on_lost=self._note_lost, on_back=self._note_back)
+        self._destination = destination
+        self._fold_next_batch = fold_next_batch or destination.fold_next_batch
+        availability = Availability(now_s=self._now_s, on_lost=self._note_lost, on_back=self._note_back)
+        self._observe = availability.observe
         self._scan = scan
         self._settings = settings
         self._report = report
@@ -181,12 +185,12 @@ class Daemon:
                 tracker.mark_pending(self._pending)
             await tracker.run()
         except Exception as error:  # noqa: BLE001 - reported and retried; must not stop the other recorders
-            fault = _one_line(error)
+            fault = one_line(error)
         finally:
             await drain.run_to_completion(self._release(tracker, fault))
 
     async def _append(self, records: Sequence[Record], on_wait: Callable[[], None]) -> Mapping[EpisodeId, str]:
-        return await self._availability.observe(self._log.append(records, on_wait))
+        return await self._observe(self._destination.append(records, on_wait))
 
     async def _release(self, tracker: VisibilityTracker, fault: str | None) -> None:
         name, state, retried = tracker.source.name, tracker.drain.state, True
@@ -218,18 +222,18 @@ class Daemon:
         attempt = 0
         busy_s = self._now_s()
         while True:
-            if self._tables.has_other_writers:
+            if self._destination.has_other_writers:
                 await _wait(self._appended_events, min(max(_LOOK_S[0], (self._now_s() - busy_s) / 10), _LOOK_S[1]))
             else:
                 await self._appended_events.wait()
             try:
-                more = self._appended_events.is_set() or await self._availability.observe(self._tables.has_unfolded())
+                more = self._appended_events.is_set() or await self._observe(self._destination.has_unfolded())
                 self._appended_events.clear()
                 busy_s = self._now_s() if more else busy_s
                 if not more:
                     await self._publish_visibility()  # of what other processes folded
                 while more:
-                    more = await self._availability.observe(self._tables.fold_next_batch())
+                    more = await self._observe(self._fold_next_batch())
                     self._publish_pending(None)
                     await self._publish_visibility()
             except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
@@ -237,7 +241,7 @@ class Daemon:
                 if isinstance(error, errors.TablesPending):
                     self._publish_pending(str(error))
                 if not isinstance(error, errors.DatabaseUnavailable):
-                    self._report_if_new(f"the tables cannot be brought up to date: {_one_line(error)}", "fold")
+                    self._report_if_new(f"the tables cannot be brought up to date: {one_line(error)}", "fold")
                 self._appended_events.set()
                 await asyncio.sleep(drain.PATIENT.pause_s(attempt, self._randomness()) or 0.0)
             else:
@@ -248,19 +252,19 @@ class Daemon:
         """Detect and refill a log that went back, also while no recorder appends."""
         while True:
             try:
-                await self._availability.observe(self._log.confirm())
+                await self._observe(self._destination.confirm())
                 self._last_lines.pop("confirm", None)
             except Exception as error:  # noqa: BLE001 - reported and retried
                 if not isinstance(error, errors.DatabaseUnavailable):
-                    self._report_if_new(f"stored events cannot be confirmed: {_one_line(error)}", "confirm")
+                    self._report_if_new(f"stored events cannot be confirmed: {one_line(error)}", "confirm")
             await asyncio.sleep(_CONFIRM_S)
 
     async def _publish_visibility(self) -> None:
         if not any(each.has_invisible for each in self._serving.values()):
             return
         before = {each: each.drain.state.appended for each in self._serving.values()}
-        behind = await self._availability.observe(self._tables.behind())
-        stopped = await self._availability.observe(self._tables.stopped())
+        behind = await self._observe(self._destination.behind())
+        stopped = await self._observe(self._destination.stopped())
         self._publish(lambda each: each.note(before[each], behind, stopped), before)
 
     def _publish_pending(self, reason: str | None) -> None:
@@ -307,7 +311,8 @@ async def _wait(event: asyncio.Event, seconds: float) -> None:
         return
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
+    """Return the message in one line, with the class of an error that is not of this package."""
     text = " ".join(str(error).split())
     return text if isinstance(error, errors.PycrormError) else f"{type(error).__name__}: {text}"
 

@@ -95,7 +95,7 @@ _BATCH_AGE_S: Final = 0.05
 """Bounds the time for which a batch gathers events: a transaction for each event would cost more than the wait."""
 _T = TypeVar("_T")
 Append: TypeAlias = Callable[[Sequence[Record], Callable[[], None]], Coroutine[Any, Any, Mapping[EpisodeId, str]]]
-"""`Log.append`, or a function that calls it."""
+"""`Destination.append`, or a function that calls it."""
 
 
 class DrainState(NamedTuple):
@@ -284,8 +284,8 @@ async def run_to_completion(work: Coroutine[Any, Any, _T]) -> _T:
 #
 # Define the writer's two ends: a source of synced records, and a log that stores them with the tables behind it.
 #
-# A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource`, `Log` and `Tables`; a plan
-# that waits for a daemon needs `OfferedQueue`.
+# A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource` and `StepwiseDestination`; a
+# plan that waits for a daemon needs `OfferedQueue`.
 
 
 class Source(Protocol):
@@ -322,8 +322,8 @@ class Source(Protocol):
         ...
 
 
-class Log(Protocol):
-    """The log in a database."""
+class Destination(Protocol):
+    """The log in a database and the tables behind it."""
 
     async def append(
         self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
@@ -346,10 +346,6 @@ class Log(Protocol):
         """Number of committed writing transactions; grows while the database makes progress."""
         return 0
 
-
-class Destination(Log, Protocol):
-    """A log and the tables behind it, for a writer that folds to the end."""
-
     async def fold(self) -> int:
         """Fold all events of the log that are not folded yet; return their number.
 
@@ -362,8 +358,8 @@ class Destination(Log, Protocol):
         ...
 
 
-class TablesPort(Protocol):
-    """The tables behind a log, for a daemon that folds in steps while it appends."""
+class StepwiseDestination(Destination, Protocol):
+    """A destination that a daemon folds in steps while it appends."""
 
     @property
     def has_other_writers(self) -> bool:
@@ -383,10 +379,6 @@ class TablesPort(Protocol):
 
     async def behind(self) -> Mapping[str, int]:
         """Return the folded sequence, by id, of each episode with events that are not visible yet."""
-        ...
-
-    async def stopped(self) -> Mapping[str, str]:
-        """Return the refused and parked episodes, as `Destination.stopped` does."""
         ...
 
 

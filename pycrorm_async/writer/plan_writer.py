@@ -7,7 +7,6 @@ end.
 import asyncio
 import logging
 import math
-import random
 import threading
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
@@ -51,17 +50,14 @@ class BackgroundWriter:
         *,
         adopt: Callable[[], Iterable[drains.Source]],
         settings: Settings,
-        randomness: Callable[[], float] = random.random,
     ) -> None:
         self._destination = destination
         self._adopt = adopt
         self._settings = settings
-        self._randomness = randomness
         self._appended_events = asyncio.Event()
         self._drain = drains.Drain(source, destination.append, settings=settings, on_append=self._note_append)
         self._adopted: list[drains.Drain] = []
         self._adoption_errors: list[str] = []
-        self._not_adopted: list[str] = []
         self._folding = asyncio.Lock()
         self._fold_error: str | None = None
         self._failure: Exception | None = None
@@ -151,9 +147,7 @@ class BackgroundWriter:
 
     async def _retry(self, operation: Callable[[], Awaitable[_T]]) -> _T:
         """Retry while the database is unavailable; the caller bounds the time."""
-        result = await drains.retry(
-            operation, backoff=drains.PATIENT, on_unavailable=self._mark_unavailable, randomness=self._randomness
-        )
+        result = await drains.retry(operation, backoff=drains.PATIENT, on_unavailable=self._mark_unavailable)
         self._fold_error = None
         return result
 
@@ -180,37 +174,34 @@ class BackgroundWriter:
     async def _adopt_all(self) -> None:
         # Recovering folders reads files; in a thread, so that it does not delay our own queue.
         sources: Iterator[drains.Source] = iter(())
+        reports: list[str] = []
         try:
             sources = await drains.run_to_completion(asyncio.to_thread(lambda: iter(self._adopt())))
             while (source := await drains.run_to_completion(asyncio.to_thread(next, sources, None))) is not None:
-                await self._drain_adopted(source)
+                await self._drain_adopted(source, reports)
         except Exception as error:  # noqa: BLE001 - in the state; must not stop our own queue
             self._adoption_errors.append(str(error))
         finally:
             if isinstance(sources, Generator):
                 sources.close()  # releases the folder that the generator holds
-            self._report_not_adopted()
+            if reports:  # one line for all, because the same records are refused at every start
+                more = f" (and {len(reports) - 1} more: see `pycrorm status`)" if len(reports) > 1 else ""
+                _log.error("%s%s", reports[0], more)
 
-    async def _drain_adopted(self, source: drains.Source) -> None:
+    async def _drain_adopted(self, source: drains.Source, reports: list[str]) -> None:
         drain = drains.Drain(
             source,
             self._destination.append,
             settings=self._settings,
             on_append=self._note_append,
-            report=self._not_adopted.append,
+            report=reports.append,
         )
         self._adopted.append(drain)
         try:
             await drain.run()
         except Exception as error:  # noqa: BLE001 - in the state; must not stop the next folder
             self._adoption_errors.append(f"{source.name}: {error}")
-            self._not_adopted.append(f"recorder {source.name}: {error}")
-
-    def _report_not_adopted(self) -> None:
-        """Log one line for all failures, because the same records are refused at every start."""
-        if self._not_adopted:
-            more = len(self._not_adopted) - 1
-            _log.error("%s%s", self._not_adopted[0], f" (and {more} more: see `pycrorm status`)" if more else "")
+            reports.append(f"recorder {source.name}: {error}")
 
 
 # === delegated writer =========================================================================================

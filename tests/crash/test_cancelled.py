@@ -260,7 +260,7 @@ async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(
                     return result
 
             folders = NotedFolders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
-            await Daemon(destination, destination, folders, settings=SETTINGS, report=report).run(leave)
+            await Daemon(destination, folders, settings=SETTINGS, report=report).run(leave)
 
         async def round_(at: int) -> bool:
             script = script_of(at)
