@@ -35,7 +35,8 @@ from __future__ import annotations
 import errno
 import mmap
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from gc import disable, enable, isenabled
 from itertools import pairwise
 from pathlib import Path
@@ -228,15 +229,12 @@ class Appender(core.Tail):
         """Return the sequence of the first event of an episode that is not open. Needs the lock."""
         if type_name != spool_format.EPISODE_STARTED and not after:
             raise errors.InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
-        self._check_open_episodes()
-        return after + 1
-
-    def _check_open_episodes(self) -> None:
-        """Refuse an episode if the list of open episodes in a header would leave no space for the largest record."""
+        # The list of open episodes in a header must leave space for the largest record.
         if not self._capacity.takes_episode(episodes=len(self.open), declared=self.declarations.bytes):
             raise errors.EpisodeRefused(
                 f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)"
             )
+        return after + 1
 
     def _declare(self, body: bytes, name: bytes, version: int, payload: bytes) -> None:
         """Repeat this declaration at the beginning of every later segment, if it fits."""
@@ -268,7 +266,13 @@ class Appender(core.Tail):
                 try:
                     segment = self._allocate(self._current.number + 1)
                 except OSError as error:
-                    raise self._allocation_refused(error) from error
+                    reason = error.strerror or str(error)
+                    if error.errno not in OUT_OF_RESOURCES:
+                        raise errors.SpoolUnavailable(self._folder, reason) from error
+                    self._disk_refused = reason
+                    self._set_limits()
+                    self._hurry()  # the sync thread retries until the disk has space
+                    raise self.full_error(reason) from error
                 self._prepared = segment
             self._begin(segment)
         self._hurry()
@@ -301,7 +305,7 @@ class Appender(core.Tail):
         frame_bytes = self._refused_bytes
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
-        return self._admits_now(frame_bytes, reserved=reserved)
+        return self._gc_lock.run(partial(self._admits, frame_bytes, reserved=reserved))
 
     @property
     def end(self) -> int:
@@ -325,10 +329,6 @@ class Appender(core.Tail):
         if self.stuck is None:
             return errors.SpoolFull(f"spool {self._folder} is full: {reason}")
         return errors.SpoolStuck(f"spool {self._folder} is full ({reason}) and cannot be emptied: {self.stuck}")
-
-    @locked
-    def _admits_now(self, frame_bytes: int, *, reserved: bool) -> bool:
-        return self._admits(frame_bytes, reserved=reserved)
 
     def _admits(self, frame_bytes: int, *, reserved: bool) -> bool:
         return self._capacity.admits(
@@ -378,15 +378,6 @@ class Appender(core.Tail):
                 if error.errno not in FULL or not self._make_room(self._capacity.segment_bytes):
                     raise
 
-    def _allocation_refused(self, error: OSError) -> errors.PycrormError:
-        reason = error.strerror or str(error)
-        if error.errno not in OUT_OF_RESOURCES:
-            return errors.SpoolUnavailable(self._folder, reason)
-        self._disk_refused = reason
-        self._set_limits()
-        self._hurry()  # the sync thread retries until the disk has space
-        return self.full_error(reason)
-
     # --- the sync thread ---------------------------------------------------------------------------------------
 
     @locked
@@ -426,40 +417,34 @@ class Appender(core.Tail):
 
     def end_sync(self, span: SyncSpan) -> None:
         """Close the segments that were full when the span was taken: they are complete and on the disk."""
-        for segment in self._complete(span):
+        sealed = span.segments[:-1]
+        self._gc_lock.run(partial(self._forget_sealed, sealed))
+        for segment in sealed:
             segment.close()
 
-    @locked
-    def _complete(self, span: SyncSpan) -> list[spool_format.Segment]:
-        done = [segment for segment in self._sealed if segment in span.segments[:-1]]
+    def _forget_sealed(self, done: Sequence[spool_format.Segment]) -> None:
         self._sealed = [segment for segment in self._sealed if segment not in done]
-        return done
 
     def prepare(self) -> bool:
         """Allocate the next segment ahead if there is none; True if the disk has no space. Raises `OSError`."""
         if self._prepared is not None or not self._segments_left():
             return False
+        refused: str | None = None
         try:
             # Holding `_gc_lock` during the allocation would block producers. Without it a finalizer could record in
             # this thread and wait for `_making`, which the thread holds: so only pause the garbage collector.
             self._gc_lock.pause_gc()
             with self._making:
-                refused = self._prepare()
+                if self._prepared is None:
+                    self._prepared = self._allocate(self._current.number + 1)
+        except OSError as error:
+            if error.errno not in OUT_OF_RESOURCES:
+                raise
+            refused = error.strerror
         finally:
             self._gc_lock.resume_gc()
         self._note_preparation(refused)
         return refused is not None
-
-    def _prepare(self) -> str | None:
-        if self._prepared is not None:
-            return None
-        try:
-            self._prepared = self._allocate(self._current.number + 1)
-        except OSError as error:
-            if error.errno not in OUT_OF_RESOURCES:
-                raise
-            return error.strerror
-        return None
 
     @locked
     def _note_preparation(self, refused: str | None) -> None:

@@ -21,7 +21,7 @@ from typing import Final
 
 from pycrorm_async.errors import SpoolFull
 from pycrorm_async.queue.appender import FULL
-from pycrorm_async.queue.format import sync_folder
+from pycrorm_async.queue.format import sync_path
 from pycrorm_async.queue.gc_safe_lock import GcSafeLock, locked
 from pycrorm_async.queue.locks import BLOBS, KEPT_BLOBS, MAKING, STORED, create_folder, open_file
 
@@ -188,10 +188,10 @@ class LiveBlobs:
         """Write the new blobs to the disk. Raises `OSError`, also for one that another program has deleted."""
         new = tuple(self._unsynced)
         for name in new:
-            _sync_file(self._folder / BLOBS / name)
+            sync_path(self._folder / BLOBS / name)
         if new:
-            sync_folder(self._folder / BLOBS)
-            sync_folder(self._folder)
+            sync_path(self._folder / BLOBS)
+            sync_path(self._folder)
             self._unsynced.difference_update(new)
 
     @locked
@@ -217,13 +217,5 @@ def _fill(path: Path, content: bytes) -> None:
             os.posix_fallocate(descriptor, 0, len(content))  # a full disk refuses here, not when the file is synced
         with os.fdopen(os.dup(descriptor), "wb") as file:
             file.write(content)
-    finally:
-        os.close(descriptor)
-
-
-def _sync_file(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
     finally:
         os.close(descriptor)

@@ -170,9 +170,9 @@ def _open_segment(path: Path) -> tuple[int, int]:
     )
 
 
-def sync_folder(folder: Path) -> None:
-    """Sync the directory entries of a folder. Raises `OSError`."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+def sync_path(path: Path) -> None:
+    """Sync a file, or the directory entries of a folder. Raises `OSError`."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
     finally:
@@ -201,7 +201,7 @@ class Segment:
             os.posix_fallocate(descriptor, 0, size)
             os.fsync(descriptor)
             unfinished.rename(path)
-            sync_folder(folder)
+            sync_path(folder)
             buffer = mmap.mmap(descriptor, size)
         except BaseException:
             os.close(descriptor)

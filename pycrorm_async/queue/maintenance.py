@@ -518,8 +518,8 @@ def _copy_aside(folder: Path) -> Path:
     copies = (folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}{each}") for each in names)
     aside = next(each for each in copies if not each.exists())
     shutil.copytree(folder, aside, copy_function=_link, ignore=shutil.ignore_patterns(ALIVE, DRAIN, PROGRESS))
-    spool_format.sync_folder(aside)
-    spool_format.sync_folder(folder.parent)
+    spool_format.sync_path(aside)
+    spool_format.sync_path(folder.parent)
     return aside
 
 
@@ -538,6 +538,6 @@ def finish_repairs(spool: Path) -> list[Path]:
             folder = repaired.with_name(repaired.name.removesuffix(MENDED))
             if not folder.exists():  # the damaged folder was renamed only after the new one was whole and synced
                 repaired.rename(folder)
-                spool_format.sync_folder(spool)
+                spool_format.sync_path(spool)
                 folders.append(folder)
     return folders

@@ -391,7 +391,7 @@ def seal(folder: Path, prefix: ValidPrefix) -> None:
             with path.open("rb+") as file:
                 file.truncate(prefix.cut.offset)
                 os.fsync(file.fileno())
-    spool_format.sync_folder(folder)
+    spool_format.sync_path(folder)
 
 
 def sync_segments(folder: Path, numbers: Iterable[int]) -> None:
@@ -406,7 +406,7 @@ def sync_segments(folder: Path, numbers: Iterable[int]) -> None:
             os.fdatasync(descriptor)
         finally:
             os.close(descriptor)
-    spool_format.sync_folder(folder)
+    spool_format.sync_path(folder)
 
 
 def tails(folder: Path, prefix: ValidPrefix) -> list[tuple[Path, bytes]]:
@@ -438,10 +438,19 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
     prefix, damage, uncommitted = survey(folder, recorder)
     if damage is not None or not uncommitted:
         return
-    for before, frame in _frames_behind(folder, recorder, prefix, prefix.cut.position - len(uncommitted)):
+    committed = prefix.cut.position - len(uncommitted)
+    first = max(number for number, base in prefix.bases.items() if base <= committed + 1)
+    segments = {number: spool_format.segment_path(folder, number) for number in prefix.bases if number >= first}
+    frames: list[tuple[spool_format.ReadCursor, spool_format.Frame]] = []
+    scanner = SegmentScanner(folder, recorder, segments=segments, on_frame=lambda *each: frames.append(each))
+    while scanner.step():
+        pass
+    for (number, offset, position), frame in frames:
+        if frame.kind == spool_format.COMMIT or position <= committed:
+            continue
         references = references_in(frame.type.decode(), frame.payload)
         if not all(is_whole(folder, each.hash) for each in references):
-            seal(folder, prefix._replace(cut=before))
+            seal(folder, prefix._replace(cut=spool_format.ReadCursor(number, offset - frame.size, position - 1)))
             return
 
 
@@ -458,26 +467,3 @@ def _all_committed(folder: Path, recorder: bytes) -> bool:
                 return frame.position <= committed
             committed = max(committed, frame.position)
     return True
-
-
-def _frames_behind(
-    folder: Path, recorder: bytes, prefix: ValidPrefix, position: int
-) -> Iterator[tuple[spool_format.ReadCursor, spool_format.Frame]]:
-    """Yield the records of a prefix behind this position, each with the cursor before it."""
-    for number, base in sorted(prefix.bases.items()):
-        if prefix.bases.get(number + 1, prefix.cut.position + 1) <= position + 1:
-            continue
-        path = spool_format.segment_path(folder, number)
-        buffer, before = spool_format.read_segment(path), base - 1
-        header = read_header(path, buffer, recorder=recorder, number=number)
-        assert header is not None, "the segment is part of the prefix"
-        offset = spool_format.header_bytes(len(header.open))
-        for fields in spool_format.decode_each(buffer, offset, spool_format.salt_of(recorder, number)):
-            frame = make(spool_format.Frame, fields)
-            if before == prefix.cut.position:
-                return
-            if frame.kind != spool_format.COMMIT:
-                if before >= position:
-                    yield spool_format.ReadCursor(number, offset, before), frame
-                before = frame.position
-            offset += frame.size

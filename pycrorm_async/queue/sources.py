@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from itertools import accumulate
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 import msgspec
 
@@ -121,7 +121,7 @@ class _EpisodeFolder:
             raise damage
         scan.seal(self.folder, prefix)
         scan.sync_segments(self.folder, prefix.bases)
-        spool_format.sync_folder(self.folder.parent)
+        spool_format.sync_path(self.folder.parent)
         self._number, self._position = prefix.cut.number, prefix.cut.position
         self._bytes = _SEGMENT_BYTES  # a sealed file is not extended: begin another
 
@@ -259,8 +259,8 @@ class DeadSource:
 
         Raises `SpoolDamaged` when only records that damage may affect remain, and `SpoolUnavailable`.
         """
-        batch = self._next(events_max, bytes_max)
-        while not (batch.complete or self._is_scanned):
+        records, complete = self._next(events_max, bytes_max)
+        while not (complete or self._is_scanned):
             try:
                 for _ in self._scan_further(events_max):
                     await asyncio.sleep(0)
@@ -268,13 +268,13 @@ class DeadSource:
                 await asyncio.to_thread(self._sync, number)
                 self._confirm(number)
             except SpoolDamaged:
-                if not batch.records:
+                if not records:
                     raise
                 break  # the next call raises
-            batch = self._next(events_max, bytes_max)
-        del self._ready[: len(batch.records)]
-        self._supplied += len(batch.records)
-        return batch.records
+            records, complete = self._next(events_max, bytes_max)
+        del self._ready[: len(records)]
+        self._supplied += len(records)
+        return records
 
     async def acknowledge(self, position: int) -> None:
         """Note that records up to this position are durable in the database; delete segments without others.
@@ -376,21 +376,15 @@ class DeadSource:
         self._confirmed = self._scanner.confirmed + len(self.lost)
         self._is_scanned = self._scanner.finished
 
-    def _next(self, events_max: int, bytes_max: int) -> _Batch:
+    def _next(self, events_max: int, bytes_max: int) -> tuple[list[Record], bool]:
+        """Return the records to supply, and whether one more would exceed a limit."""
         records = self._ready[: min(events_max, self._confirmed - self._supplied)]
         sizes = [len(record.payload) for record in records]
         total = sum(sizes)
         if total < bytes_max:
-            return _Batch(records, complete=len(records) == events_max)
+            return records, len(records) == events_max
         fitting = sum(size <= bytes_max for size in accumulate(sizes))
-        return _Batch(records[: max(1, fitting)], complete=True)
-
-
-class _Batch(NamedTuple):
-    """Records to supply. `complete`: one more would exceed a limit."""
-
-    records: list[Record]
-    complete: bool
+        return records[: max(1, fitting)], True
 
 
 def computed_ends(prefix: scan.ValidPrefix) -> tuple[Record, ...]:

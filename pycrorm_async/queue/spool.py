@@ -39,7 +39,7 @@ import msgspec
 from pycrorm_async.errors import PycrormError, SpoolForeign, SpoolTaken, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.queue import locks
-from pycrorm_async.queue.format import segment_numbers, segment_path, sync_folder
+from pycrorm_async.queue.format import segment_numbers, segment_path, sync_path
 from pycrorm_async.settings import FileAccess
 
 BINDING: Final = "log"
@@ -269,8 +269,8 @@ def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[P
             raise SpoolUnavailable(unfinished, "was deleted while it was being created")
     with wrap_os_errors(folder):
         unfinished.rename(folder)
-        sync_folder(spool)
-        sync_folder(spool.parent)
+        sync_path(spool)
+        sync_path(spool.parent)
     return folder, alive
 
 
@@ -313,7 +313,7 @@ def write_durably(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     unfinished.replace(path)
-    sync_folder(path.parent)
+    sync_path(path.parent)
 
 
 # === drain status =============================================================================================

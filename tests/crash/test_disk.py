@@ -18,9 +18,9 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.codec import Record, is_computed_end
 from pycrorm_async.events.types import references_in
-from pycrorm_async.queue import RecorderQueue, blobs, open_dead
+from pycrorm_async.queue import RecorderQueue, open_dead
 from pycrorm_async.queue.blobs import is_whole
-from pycrorm_async.queue.format import EVENT, Segment, salt_of
+from pycrorm_async.queue.format import EVENT, Segment, salt_of, sync_path
 from pycrorm_async.settings import Settings
 from tests.crash.disk_machine import (
     ON_A_SMALL_DISK,
@@ -203,7 +203,7 @@ class BlobMachine:
         self._rng = rng
         self._whole: set[str] = set()  # blobs whose content was synced
         self._named: set[str] = set()  # blobs, and their folder, whose name was synced
-        fsync, sync_file, cut = os.fsync, blobs._sync_file, machine.cut
+        fsync, sync_file, cut = os.fsync, sync_path, machine.cut
 
         def sync(path: Path) -> None:
             machine.cut()
@@ -223,7 +223,7 @@ class BlobMachine:
             self._keep_some(machine.cuts[-1][0] / "blobs")
 
         patch.setattr(os, "fsync", observed_fsync)
-        patch.setattr(blobs, "_sync_file", sync)
+        patch.setattr("pycrorm_async.queue.blobs.sync_path", sync)
         patch.setattr(machine, "cut", cut_with_blobs)
 
     def put_referring(self) -> None:
