@@ -4,7 +4,7 @@ The soak runs more and longer rounds (`python -m pytest -m soak tests/crash`), s
 follow from a seed that is printed, and that PYCRORM_TEST_SEED sets.
 
  1  SIGKILL at any moment
-        test_killed (24 recorders, 10,000 in the soak), test_daemon, test_many_machines
+        test_killed (12 recorders, 10,000 in the soak), test_daemon, test_many_machines
  2  killed at each step that touches disk or log, and once more
         test_crash_points; queue/test_dead_source (sealing, removing), queue/test_maintenance
  3  power cut: any sectors of what was not synced

@@ -38,8 +38,8 @@ from tests.writer.fakes import KeptSource
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
-STRIDES = pytest.mark.parametrize("stride", [8, pytest.param(1, marks=pytest.mark.soak)])
-"""A run cancels at an eighth of the awaits, chosen by its seed, and the soak at all of them."""
+STRIDES = pytest.mark.parametrize("stride", [16, pytest.param(1, marks=pytest.mark.soak)])
+"""A run cancels at a sixteenth of the awaits, chosen by its seed, and the soak at all of them."""
 SETTINGS = Settings(batch_events_max=10, idle_ms=1)
 CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}
 """SQLAlchemy and asyncpg leave these tasks to the loop when they are cancelled while they close a connection."""
