@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 from sqlalchemy import select
 
-from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import Observation, ObservationValue
+from pycrorm_async.query.frames import imported
 from pycrorm_async.query.question import AskedEpisode, episode_name
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
@@ -30,10 +30,7 @@ async def read_samples(reading: Reading, /, stream: str, *, episode: AskedEpisod
 
     Raises `UnknownEpisode`; `CallerError` for a stream that the episode does not have; `MissingExtra` without pandas.
     """
-    try:
-        import pandas as pd
-    except ImportError:
-        raise MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
+    pandas = imported("pandas")
     number = (await reading.episode(episode_name(episode))).number
     observation, value = Observation, ObservationValue
     sampled = (
@@ -51,8 +48,7 @@ async def read_samples(reading: Reading, /, stream: str, *, episode: AskedEpisod
         blob = await reading.blob(sha256)
         if blob is None:
             raise CallerError(f"a block of {stream!r} is not stored: `pycrorm verify` names its event")
-        frames.append(pd.DataFrame(dict(table_of(blob.content))))
-    frame = pd.concat(frames, ignore_index=True).sort_values(TIME, kind="stable", ignore_index=True)
-    times: Any = frame[TIME].to_numpy().astype("datetime64[ns]")
-    frame.insert(0, "time", pd.Series(times, dtype=np.dtype("datetime64[ns]")).dt.tz_localize("UTC"))
+        frames.append(pandas.DataFrame(dict(table_of(blob.content))))
+    frame: pd.DataFrame = pandas.concat(frames, ignore_index=True).sort_values(TIME, kind="stable", ignore_index=True)
+    frame.insert(0, "time", pandas.to_datetime(frame[TIME], unit="ns", utc=True))
     return frame

@@ -65,9 +65,9 @@ class Compared(NamedTuple):
 
     def __str__(self) -> str:
         """Return it as `height: wanted 0.93, was 0.9 (0.03 off, tolerance 0.1)`."""
-        actual = "not known" if self.found is None else f"was {_text(self.found)}"
+        actual = f"{'was ' if self.found is not None else ''}{value_text(self.found)}"
         off = "" if self.difference is None else f" ({self.difference:.3g} off, tolerance {self.tolerance:.3g})"
-        return f"{self.feature}: wanted {_text(self.wanted)}, {actual}{off}"
+        return f"{self.feature}: wanted {value_text(self.wanted)}, {actual}{off}"
 
 
 class Typical(NamedTuple):
@@ -414,13 +414,15 @@ def _has(value: object, word: str) -> bool:
 
 
 def _missed(compared: Compared) -> str:
-    actual = "not known" if compared.found is None else _text(compared.found)
     off = "" if compared.difference is None else f" ({compared.difference:.3g} off)"
-    return f"{compared.feature} {actual}{off}"
+    return f"{compared.feature} {value_text(compared.found)}{off}"
 
 
-def _text(value: str | tuple[str, ...] | float) -> str:
+def value_text(value: str | tuple[str, ...] | float | None) -> str:
+    """Format the value of a feature, on one line."""
     match value:
+        case None:
+            return "not known"
         case float():
             return f"{value:.4g}"
         case tuple():
@@ -625,13 +627,10 @@ class Sequences:
 
 
 def _chosen(group: Group, status: str | None, reason: str | None) -> Mask:
-    chosen = np.ones(len(group), np.bool_)
+    chosen = group.performed
     for feature, word in (("status", status), ("reason", reason)):
         if word is not None:
-            column = group.texts.get(feature)
-            chosen &= column is not None and column.having(word)
-    if "simulated" in group.texts:
-        chosen &= ~group.texts["simulated"].present()
+            chosen &= group.having(feature, word)
     return chosen
 
 

@@ -92,6 +92,17 @@ class Group:
         """Return the number of cases."""
         return int(self.nodes.size)
 
+    def having(self, feature: str, word: str, rows: slice = slice(None)) -> Mask:
+        """Return a mask of these rows: True where the text feature of the case has the word."""
+        column = self.texts.get(feature)
+        return np.zeros(self.nodes[rows].size, np.bool_) if column is None else column.having(word, rows)
+
+    @property
+    def performed(self) -> Mask:
+        """A mask of the cases that are no simulations."""
+        simulated = self.texts.get("simulated")
+        return np.ones(len(self), np.bool_) if simulated is None else ~simulated.present()
+
     def taken(self, rows: NDArray[Any]) -> Group:
         """Return the group of some of its cases: of these rows, or those for which a mask is True."""
         arrays = self.nodes[rows], self.started_us[rows], self.parents[rows]

@@ -146,8 +146,7 @@ def _tries(group: Group, object_type: ObjectType, arm: Arms | None) -> tuple[NDA
     wanted &= np.isin(grasps, [*Grasp.__members__])
     succeeded = _texts(group, "status") == "SUCCEEDED"
     wanted &= succeeded | (_texts(group, "status") == "FAILED")
-    if "simulated" in group.texts:
-        wanted &= ~group.texts["simulated"].present()
+    wanted &= group.performed
     wanted &= ~np.isnan(numbers["stand_x"] + numbers["stand_y"] + numbers["stand_yaw"] + over_base)
     rows = np.flatnonzero(wanted)[:TRIES_MAX]  # the newest come first
     place = (numbers["stand_x"], numbers["stand_y"], numbers["stand_yaw"], over_base, torso)

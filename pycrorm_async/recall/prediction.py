@@ -162,7 +162,7 @@ class _Tries:
         for group in library.groups(type_):
             ended = _ended(group) & ~_within(bounds, group.nodes)
             like = ended & _having(group, of_object)
-            successes += int((like & group.texts["status"].having("SUCCEEDED")).sum())
+            successes += int((like & group.having("status", "SUCCEEDED")).sum())
             count += int(like.sum())
             rows = np.flatnonzero(like & _having(group, words))[:TRIES_MAX]
             if rows.size:
@@ -174,7 +174,7 @@ class _Tries:
         evidence, successes, cases, reason = 0.0, 0.0, (), None
         if tries is not None:
             likeness = np.exp(-_distance(tries, situation, library) / 2)
-            succeeded = tries.texts["status"].having("SUCCEEDED")
+            succeeded = tries.having("status", "SUCCEEDED")
             evidence, successes = float(likeness.sum()), float(likeness[succeeded].sum())
             order = np.argsort(-likeness, kind="stable")[:_CASES_MAX]
             cases, reason = tuple(tries.nodes[order[likeness[order] >= _LIKE_MIN]].tolist()), _reason(tries, likeness)
@@ -194,19 +194,15 @@ def _within(bounds: NDArray[np.int64], nodes: NDArray[np.int64]) -> NDArray[np.b
 
 def _ended(group: Group) -> NDArray[np.bool_]:
     """Return a mask of the tries: what succeeded or failed, outside of simulations, and was not refused."""
-    status = group.texts["status"]
-    ended = status.having("SUCCEEDED") | status.having("FAILED")
-    if "simulated" in group.texts:
-        ended &= ~group.texts["simulated"].present()
-    if "reason" in group.texts:  # what a prediction refused was not tried
-        ended &= ~group.texts["reason"].having(RefusedByPrediction.__name__)
-    return ended
+    ended = group.having("status", "SUCCEEDED") | group.having("status", "FAILED")
+    # What a prediction refused was not tried.
+    return np.asarray(ended & group.performed & ~group.having("reason", RefusedByPrediction.__name__))
 
 
 def _having(group: Group, words: Mapping[str, str]) -> NDArray[np.bool_]:
     mask = np.ones(len(group), np.bool_)
     for feature, word in words.items():
-        mask &= group.texts[feature].having(word) if feature in group.texts else False
+        mask &= group.having(feature, word)
     return mask
 
 

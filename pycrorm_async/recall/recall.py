@@ -15,7 +15,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib import import_module
 from inspect import isawaitable
 from numbers import Real
 from types import MappingProxyType
@@ -32,7 +31,7 @@ from pycrorm_async.orm import BatchRolloutAction, EpisodeRobot, EpisodeTag, Task
 from pycrorm_async.plan.language import ActionDescription, Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.projections.generations import PROJECTION, read_generation
-from pycrorm_async.query.frames import member_of
+from pycrorm_async.query.frames import imported, member_of
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
@@ -346,25 +345,14 @@ class Recall:
 
 def frame_of(recalled: Answer) -> pd.DataFrame:
     """Return an answer as a data frame. Raises `MissingExtra` without pandas."""
-    try:
-        pandas = import_module("pandas")
-    except ImportError:
-        raise errors.MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
+    columns = "score node episode sequence type started status reason duration".split()
     rows = []
     for each in recalled:
         case = each.case
-        outcome = {"status": case.status, "reason": case.reason, "duration": case.duration_s}
-        place: dict[str, Any] = {
-            "node": case.node,
-            "episode": case.episode,
-            "sequence": case.sequence,
-            "type": case.type,
-        }
-        rows.append(
-            {"score": each.score, **place, "started": case.started_at, **outcome, **case.symbols, **case.numbers}
-        )
-    columns = ["score", "node", "episode", "sequence", "type", "started", "status", "reason", "duration"]
-    frame: pd.DataFrame = pandas.DataFrame(rows) if rows else pandas.DataFrame(columns=columns)
+        place = case.node, case.episode, case.sequence, case.type, case.started_at
+        own = each.score, *place, case.status, case.reason, case.duration_s
+        rows.append({**dict(zip(columns, own, strict=True)), **case.symbols, **case.numbers})
+    frame: pd.DataFrame = imported("pandas").DataFrame(rows, columns=None if rows else columns)
     return frame
 
 

@@ -106,9 +106,7 @@ def weights_of(cue: Cue, library: CaseLibrary) -> Weights:
     else:
         groups = [(group, _ended_by(group, cue.as_of_us)) for group in library.groups(cue.type)]
         cases = sum(int(ended.sum()) for _, ended in groups)
-        seen = [
-            sum(int((_having(group, each, slice(None)) & ended).sum()) for group, ended in groups) for each in cue.has
-        ]
+        seen = [sum(int((group.having(*each) & ended).sum()) for group, ended in groups) for each in cue.has]
     words = tuple(min(WEIGHT_MAX, math.log((cases + 1) / (count + 1)) + 0.1) for count in seen)
     tolerances = tuple(each.tolerance or library.tolerance(cue.type, each.feature) for each in cue.near)
     never_seen = tuple(pair for pair, count in zip(cue.has, seen, strict=True) if count == 0)
@@ -227,25 +225,20 @@ def _reachable(group: Group, cue: Cue, weights: Weights) -> float:
 def _conditions(group: Group, rows: slice, cue: Cue) -> Iterator[Mask]:
     """Yield a mask of the rows that fulfil it for each condition, except the times of their starts."""
     for pair in cue.lacks:
-        yield ~_having(group, pair, rows)
+        yield ~group.having(*pair, rows)
     for pair in cue.requires:
-        yield _having(group, pair, rows)
+        yield group.having(*pair, rows)
     if cue.episodes is not None:
         yield np.isin(group.episodes[rows], list(cue.episodes))
     if cue.prohibit:
         yield np.isin(group.nodes[rows], list(cue.prohibit), invert=True)
     if not cue.simulated and "simulated" in group.texts:
-        yield ~group.texts["simulated"].present()[rows]
+        yield group.performed[rows]
     if cue.during_us is not None:
         yield group.started_us[rows] >= cue.during_us[0]
         yield _ended_by(group, cue.during_us[1], rows)
     if cue.as_of_us is not None:
         yield _ended_by(group, cue.as_of_us, rows)
-
-
-def _having(group: Group, pair: tuple[str, str], rows: slice) -> Mask:
-    column = group.texts.get(pair[0])
-    return np.zeros(group.nodes[rows].size, np.bool_) if column is None else column.having(pair[1], rows)
 
 
 def _ended_by(group: Group, moment_us: int, rows: slice = slice(None)) -> Mask:

@@ -29,7 +29,7 @@ from pycrorm_async.orm import RootFailure
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.recall.answer import Answer, Compared, RecalledCase, answer
+from pycrorm_async.recall.answer import Answer, Compared, RecalledCase, answer, value_text
 from pycrorm_async.recall.blocks import CaseLibrary, Group
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, cue_like
@@ -310,19 +310,9 @@ def _listed(compared: Sequence[Compared], text: Callable[[Compared], str]) -> li
 def _alike(compared: Compared) -> str:
     """Return a feature that is alike, as `arm LEFT` or `height 0.9 (0.03 off)`."""
     off = f" ({compared.difference:.2g} off)" if compared.difference and compared.similarity < 1 else ""
-    return f"{compared.feature} {_value(compared.wanted if off == '' else compared.found)}{off}"
+    return f"{compared.feature} {value_text(compared.wanted if off == '' else compared.found)}{off}"
 
 
 def _differs(compared: Compared) -> str:
     """Return a feature that differs, as `arm RIGHT, here LEFT`."""
-    actual = "not known" if compared.found is None else _value(compared.found)
-    return f"{compared.feature} {actual}, here {_value(compared.wanted)}"
-
-
-def _value(value: str | tuple[str, ...] | float | None) -> str:
-    match value:
-        case float():
-            return f"{value:.4g}"
-        case tuple():
-            return ", ".join(value)
-    return str(value)
+    return f"{compared.feature} {value_text(compared.found)}, here {value_text(compared.wanted)}"
