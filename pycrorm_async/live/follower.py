@@ -71,18 +71,11 @@ class EpisodeFeed:
     """
 
     def __init__(self, row: EpisodeRow, address: DatabaseAddress, first: int) -> None:
+        self.id, self.number = row.id, row.number
         self._page = EpisodePage(row, address, first)
         self._reading = asyncio.Lock()
         self.listeners = 0
         self.fault: str | None = row.refused
-
-    @property
-    def id(self) -> str:
-        return self._page.id
-
-    @property
-    def number(self) -> int:
-        return self._page.number
 
     @property
     def last(self) -> int:
@@ -303,15 +296,15 @@ class LiveOverview:
 
     Attributes:
         listeners: number of pages that follow it.
+        turn: counts the turns in which an entry changed.
     """
 
     def __init__(self, address: DatabaseAddress, replica: DatabaseAddress | None) -> None:
-        self.listeners = 0
+        self.listeners = self.turn = 0
         self._reading = Reading(address, replica=replica)
         self._activities: dict[int, Activity] = {}
         self._changed_at: dict[int, int] = {}
         """The turn in which an episode's entry changed last, by its number."""
-        self._turn = 0
         self._folding = asyncio.Lock()
         self._unjudged: set[int] = set()
         """Numbers of the episodes whose failures may have other outcomes by now."""
@@ -325,17 +318,12 @@ class LiveOverview:
         is_behind = any(each.number == number for each in await log.behind())
         return None if is_behind else await outcomes_of(self._reading, number)
 
-    @property
-    def turn(self) -> int:
-        """Counts the turns in which an entry changed."""
-        return self._turn
-
     async def catch_up(self, log: EventLog, rows: Iterable[EpisodeRow]) -> bool:
         """Fold the new events of these episodes; return whether any entry changed."""
         async with self._folding:
             grown = [each for each in rows if self._is_behind(each)]
             designators = await log.dtypes() if grown else {}
-            turn = self._turn + 1
+            turn = self.turn + 1
             for row in grown:
                 activity = self._activities.setdefault(row.number, Activity(row))
                 activity.row = row
@@ -346,7 +334,7 @@ class LiveOverview:
             if not grown and not judged:
                 return False
             self._changed_at |= dict.fromkeys(judged, turn)
-            self._turn = turn
+            self.turn = turn
             self._forget()
             return True
 
@@ -550,15 +538,11 @@ class Activity:
         """The nodes from the root's child down to the one that started last, the innermost ones with parameters."""
         path: list[str] = []
         node: int | None = max(self._running, default=None)
-        while node is not None and (parent := self._parent_of(node)) is not None:
-            text = self._running.get(node, "")
+        while (running := self._nodes_running.get(node or 0)) is not None and running.parent is not None:
+            text = self._running.get(node or 0, "")
             path.append(text if len(path) < _NODES_IN_FULL else text.partition(" ")[0])
-            node = parent
+            node = running.parent
         return [each[:_TEXT_MAX] for each in reversed(path) if each]
-
-    def _parent_of(self, node: int) -> int | None:
-        running = self._nodes_running.get(node)
-        return None if running is None else running.parent
 
     def entry(self) -> dict[str, Any]:
         """Return its row, with the keys of `report.overview`; its times are those of the tables, in µs."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any, TypeAlias
@@ -274,29 +274,47 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
 
     observations, detected = await by_node(observed, func.count()), await by_node(seen, func.count())
     places = await by_node(search, func.sum(search.considered), func.sum(search.offered))
-    children: dict[int | None, list[NodeSummary]] = {}
-    for row in await connection.execute(nodes_of(number)):
+    rows = {row.id: row for row in await connection.execute(nodes_of(number))}
+    tree = []
+    for key, depth in depth_first({key: row.parent_id for key, row in rows.items()}):
+        row = rows[key]
         parameters = with_object_names(
             row.parameters or {}, lambda each: names.get(row_id(number, each["row"], SLOT_NODE))
         )
-        considered, offered = map(int, places.get(row.id, (0, 0)))
-        children.setdefault(row.parent_id, []).append(
+        considered, offered = map(int, places.get(key, (0, 0)))
+        tree.append(
             NodeSummary(
-                depth=0,
+                depth=depth,
                 parameters=parameters,
-                status=row.status.name if isinstance(row.status, TaskStatus) else row.status,
+                status=_name(row.status),
                 started_at=row.start_time,
                 duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
-                thoughts=tuple(simulations.get(row.id, ())),
-                sequence=row_key(row.id).sequence,
-                observations=observations.get(row.id, (0,))[0],
+                thoughts=tuple(simulations.get(key, ())),
+                sequence=row_key(key).sequence,
+                observations=observations.get(key, (0,))[0],
                 considered=considered,
                 offered=offered,
-                detected=detected.get(row.id, (0,))[0],
+                detected=detected.get(key, (0,))[0],
                 **{name: getattr(row, name) for name in _OF_NODE},
             )
         )
-    return list(_depth_first(children))
+    return tree
+
+
+def depth_first(parents: Mapping[int, int | None]) -> Iterator[tuple[int, int]]:
+    """Yield each node with its depth, parents first, children in the order of `parents`, which has each node's parent.
+
+    >>> [*depth_first({1: None, 2: 1, 3: 1, 4: 2})]
+    [(1, 0), (2, 1), (4, 2), (3, 1)]
+    """
+    children: dict[int | None, list[int]] = {}
+    for node, parent in parents.items():
+        children.setdefault(parent, []).append(node)
+    stack = [(node, 0) for node in reversed(children.get(None, []))]
+    while stack:
+        node, depth = stack.pop()
+        yield node, depth
+        stack.extend((child, depth + 1) for child in reversed(children.get(node, [])))
 
 
 async def observed_contents(connection: AsyncConnection, number: int) -> list[tuple[str, int, int | None]]:
@@ -322,14 +340,6 @@ async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict
     for row in await connection.execute(query):
         numbers.setdefault(row_id(number, row.thought_by_node, SLOT_NODE), []).append(row.id)
     return numbers
-
-
-def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[NodeSummary]:
-    stack = [(node, 0) for node in reversed(children.get(None, []))]
-    while stack:
-        node, depth = stack.pop()
-        yield replace(node, depth=depth)
-        stack.extend((child, depth + 1) for child in reversed(children.get(node.id, [])))
 
 
 # === episode list =============================================================================================

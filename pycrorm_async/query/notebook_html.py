@@ -340,9 +340,7 @@ _SQL_MAX = 5_000
 
 def sql_result_html(result: SqlResult) -> str:
     """Return the first rows as a table; a missing value is an empty cell."""
-    rows = ["" if value is None else texts.recorded(value) for row in result.rows[:_ROWS_MAX] for value in row]
-    width = len(result.columns)
-    cells = [rows[start : start + width] for start in range(0, len(rows), width)] if width else []
+    cells = [["" if value is None else texts.recorded(value) for value in row] for row in result.rows[:_ROWS_MAX]]
     count = f"<b>{len(result.rows):,} row{'s' * (len(result.rows) != 1)}</b>"
     limited = f" {texts.quiet('and more, which a limit left out')}" if result.more else ""
     return texts.view(

@@ -251,7 +251,8 @@ def jpeg_of(image: bytes | NDArray[np.uint8], side: int) -> bytes:
 PICTURES_MAX: Final = 24
 """Bounds the pictures of a task tree or a moment, which a notebook keeps with the cell."""
 _PICTURE_SIDE: Final = 160
-_PICTURED_BYTES_MAX: Final = 64_000_000
+_CONTENT_MAX: Final = 64_000_000
+"""Bounds the bytes of a content that is read for a picture of it."""
 
 
 class ObservedPicture(NamedTuple):
@@ -306,17 +307,15 @@ def _small_jpeg(image: bytes | NDArray[np.uint8], side: int) -> bytes:
         raise ValueError("a smaller one needs Pillow: pip install 'pycrorm-async[pictures]'") from None
 
 
-async def _picture(log: EventLog, content: Content) -> tuple[str, str]:
-    """Return address and text of a picture of a content."""
-    try:
-        with log.translated():
-            data = await log.blobs.read_blob(content.hash) if content.size <= _PICTURED_BYTES_MAX else None
-        if data is None:
-            raise ValueError(f"its {content.size:,} bytes are not in the log, or too many for a notebook")  # noqa: TRY301
-        address, _, text = await asyncio.to_thread(picture_of, content, data, _PICTURE_SIDE)
-    except ValueError as reason:
-        return "", str(reason)
-    return address, text
+async def read_content(log: EventLog, content: Content) -> bytes:
+    """Return the bytes of a content. Raises `ValueError` for one that is missing or too large to be shown."""
+    if content.size > _CONTENT_MAX:
+        raise ValueError(f"it has {content.size:,} bytes, more than {_CONTENT_MAX:,}")
+    with log.translated():
+        data = await log.blobs.read_blob(content.hash)
+    if data is None:
+        raise ValueError("its content is not in the log")
+    return data
 
 
 async def read_pictures(
@@ -334,8 +333,12 @@ async def read_pictures(
                 continue
             for each in contents_in(happening.values) if isinstance(happening, Observed) else ():
                 if each.kind in ("image", "depth") and len(pictures) < PICTURES_MAX:
-                    shown = await _picture(log, each)
-                    pictures.append(ObservedPicture(node, sequence, f"{name} {each.path}".rstrip(), *shown))
+                    try:
+                        data = await read_content(log, each)
+                        address, _, text = await asyncio.to_thread(picture_of, each, data, _PICTURE_SIDE)
+                    except ValueError as reason:
+                        address, text = "", str(reason)
+                    pictures.append(ObservedPicture(node, sequence, f"{name} {each.path}".rstrip(), address, text))
     return tuple(pictures)
 
 

@@ -45,6 +45,7 @@ from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.columns import physical_name, unite
 from pycrorm_async.projections.generations import Generation, all_views, current_generation, with_views
 from pycrorm_async.query import named_queries
+from pycrorm_async.query import sql as read_only_sql
 from pycrorm_async.query.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.frames import BATCH_ROWS, Library, arrow_batches, columns_of, dataframe, select_of
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
@@ -52,7 +53,7 @@ from pycrorm_async.query.notebook import Episodes, TaskTree  # and registers the
 from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion, translated_errors
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.snapshot import Moment, as_of
-from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
+from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.query.text import quiet, view
 from pycrorm_async.store.address import DatabaseAddress, check_replica, no_tables
 from pycrorm_async.store.lake import open_lake
@@ -284,13 +285,13 @@ class Reading:
         Raises `QueryRefused`, on PostgreSQL also for a login that may not take the role `pycrorm_reader`.
         """
         await self._ready()
-        return await ReadOnlySql(self._log).query(sql, limits)
+        return await read_only_sql.query(self._log, sql, limits)
 
     @asynccontextmanager
     async def stream(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> AsyncIterator[SqlRows]:
         """Run such a query and read its rows, with `async for`, while it runs; see `query`."""
         await self._ready()
-        async with ReadOnlySql(self._log).stream(sql, limits) as rows:
+        async with read_only_sql.stream(self._log, sql, limits) as rows:
             yield rows
 
     @property

@@ -13,7 +13,7 @@ Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from numbers import Integral, Real
@@ -27,7 +27,15 @@ from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import DescriptionDeclared, EpisodeEnded
 from pycrorm_async.projections.fold import happening_of
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
+from pycrorm_async.query.named_queries import (
+    EpisodeSummary,
+    NodeSummary,
+    Percept,
+    PlaceSearch,
+    depth_first,
+    percepts_in,
+    search_in,
+)
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.replay import LATEST_MAX, EpisodeReplay, ReplayedNode, WorldObject
 from pycrorm_async.query.text import NotebookValue
@@ -381,7 +389,10 @@ def moment_of(
         time_s=replay.at.since_ns / 1e9,
         at=utc_of(replay.wall_ns // 1000),
         status=replay.status,
-        tree=tuple(_tree(replay)),
+        tree=tuple(
+            _node(replay, replay.nodes[sequence], depth)
+            for sequence, depth in depth_first({sequence: each.parent for sequence, each in replay.nodes.items()})
+        ),
         world=_world(replay, descriptions, meshes),
         observations={
             name: ObservationThen(
@@ -397,17 +408,6 @@ def moment_of(
         percepts=tuple(percepts[-LATEST_MAX:]),
         places=tuple(search_in(number, *answer) for answer in replay.searches),
     )
-
-
-def _tree(replay: EpisodeReplay) -> Iterator[NodeThen]:
-    children: dict[int | None, list[int]] = {}
-    for sequence, node in replay.nodes.items():
-        children.setdefault(node.parent, []).append(sequence)
-    stack = [(sequence, 0) for sequence in reversed(children.get(None, []))]
-    while stack:
-        sequence, depth = stack.pop()
-        yield _node(replay, replay.nodes[sequence], depth)
-        stack.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
 
 
 def _node(replay: EpisodeReplay, node: ReplayedNode, depth: int) -> NodeThen:

@@ -1,8 +1,7 @@
 """Run SQL that a user or a program wrote, with bounds on its time, rows and bytes, on connections that can only read.
 
-sql = ReadOnlySql(log)
-result = await sql.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GROUP BY dtype")
-async with sql.stream("SELECT * FROM event", SqlLimits(rows=None)) as rows:
+result = await query(log, "SELECT dtype, count(*) AS nodes FROM task_tree_node GROUP BY dtype")
+async with stream(log, "SELECT * FROM event", SqlLimits(rows=None)) as rows:
     async for row in rows: ...
 
 **Theory of operation.** The text of a query is untrusted: a user or a language model wrote it. Each query has a
@@ -27,7 +26,7 @@ import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -145,7 +144,7 @@ _MISSING_FROM = "errorMissingRTE"
 language of the server."""
 
 
-class _Cursor:
+class _ServerCursor:
     def __init__(self, connection: asyncpg.Connection[Any], bytes_max: int) -> None:
         self.columns: tuple[str, ...] = ()
         self._connection = connection
@@ -255,13 +254,13 @@ def _declaration(query: str, columns: int, bytes_max: int) -> str:
 
 
 @asynccontextmanager
-async def postgresql_cursor(engine: AsyncEngine, sql: str, *, bytes_max: int, seconds: float) -> AsyncIterator[_Cursor]:
+async def _server_cursor(engine: AsyncEngine, sql: str, limits: SqlLimits) -> AsyncIterator[Cursor]:
     """Run one query on a connection of its own, which is closed at the end."""
     async with engine.connect() as connection:
         try:
             driver: Any = (await connection.get_raw_connection()).driver_connection
-            cursor = _Cursor(driver, bytes_max)
-            await cursor.start(sql, seconds)
+            cursor = _ServerCursor(driver, limits.bytes)
+            await cursor.start(sql, limits.seconds)
             yield cursor
         finally:
             await connection.invalidate()  # ends the transaction too: nothing was committed
@@ -371,37 +370,27 @@ class SqlRows:
                 return
 
 
-class ReadOnlySql:
-    """Runs queries in SQL on the database of a log. Needs no closing: each query has its own connection."""
+async def query(log: EventLog, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
+    """Return the rows of one query on the database of a log. Raises what `stream` raises."""
+    async with stream(log, sql, limits) as rows:
+        collected = [row async for row in rows]
+        return SqlResult(rows.columns, collected, rows.more)
 
-    def __init__(self, log: EventLog) -> None:
-        self._log = log
 
-    async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
-        """Return the rows of one query. Raises what `stream` raises."""
-        async with self.stream(sql, limits) as rows:
-            collected = [row async for row in rows]
-            return SqlResult(rows.columns, collected, rows.more)
+@asynccontextmanager
+async def stream(log: EventLog, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> AsyncIterator[SqlRows]:
+    """Run one query, on a connection of its own, and read its rows while it runs.
 
-    @asynccontextmanager
-    async def stream(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> AsyncIterator[SqlRows]:
-        """Run one query and read its rows while it runs.
-
-        Raises `QueryRefused` for a text that is not one query, would do more than read, is wrong, or takes longer than
-        it may; and on PostgreSQL for a login that may not take the role `pycrorm_reader`. Raises `DatabaseUnavailable`.
-        """
-        with self._log.translated():
-            async with self._cursor(sql, limits) as cursor:
-                yield SqlRows(cursor, limits)
-
-    def _cursor(self, sql: str, limits: SqlLimits) -> AbstractAsyncContextManager[Cursor]:
-        if not _CHARACTERS.fullmatch(sql):
-            raise QueryRefused("a query in SQL has no character U+0000 and no half of a surrogate pair")
-        if self._log.address.is_sqlite:
-            return sqlite_cursor(self._log.address.path, sql, bytes_max=limits.bytes, seconds=limits.seconds)
-        # Loading the driver of a server takes a tenth of a second.
-
-        return postgresql_cursor(self._log.engine, sql, bytes_max=limits.bytes, seconds=limits.seconds)
+    Raises `QueryRefused` for a text that is not one query, would do more than read, is wrong, or takes longer than it
+    may; and on PostgreSQL for a login that may not take the role `pycrorm_reader`. Raises `DatabaseUnavailable`.
+    """
+    if not _CHARACTERS.fullmatch(sql):
+        raise QueryRefused("a query in SQL has no character U+0000 and no half of a surrogate pair")
+    with log.translated():
+        is_file = log.address.is_sqlite
+        cursors = _sqlite_cursor(log.address.path, sql, limits) if is_file else _server_cursor(log.engine, sql, limits)
+        async with cursors as cursor:
+            yield SqlRows(cursor, limits)
 
 
 # === refusals =================================================================================================
@@ -599,11 +588,11 @@ def _refusal(
 
 
 @asynccontextmanager
-async def sqlite_cursor(path: Path, sql: str, *, bytes_max: int, seconds: float) -> AsyncIterator[_ProcessCursor]:
+async def _sqlite_cursor(path: Path, sql: str, limits: SqlLimits) -> AsyncIterator[Cursor]:
     """Run one query on the file at this path."""
     cursor = _ProcessCursor()
     try:
-        await cursor.start(path, sql, bytes_max, seconds)
+        await cursor.start(path, sql, limits.bytes, limits.seconds)
         yield cursor
     finally:
         await asyncio.to_thread(cursor.close)

@@ -12,9 +12,6 @@ import msgspec
 
 from pycrorm_async.events.types import BLOB_KEY, is_missing
 
-#
-# Format recorded parameters and durations on one line, for the terminal, notebooks and the report.
-
 _TEXT_MAX = 60
 """Bounds the characters of a text parameter, so that a node fits on one line."""
 

@@ -27,8 +27,6 @@ _BYTES_MAX: Final[Mapping[Images, int]] = {"none": 0, "thumbs": 4_500_000, "full
 """Bounds the bytes of all pictures of a page; in base64 they take a third more."""
 _POINTS_MAX: Final = 8_000
 """Bounds the points of a cloud; every n-th is drawn."""
-_CONTENT_MAX: Final = 64_000_000
-"""Bounds the bytes of a content that is read for a page."""
 
 
 class ObservedContent(NamedTuple):
@@ -95,14 +93,9 @@ class _Maker:
         return {**entry, "content": self._numbers[content.hash], "text": self._texts[content.hash]}
 
     async def _make(self, content: Content) -> None:
-        if content.size > _CONTENT_MAX:
-            raise ValueError(f"it has {content.size:,} bytes, more than {_CONTENT_MAX:,}")
         if self._left <= 0:
             raise ValueError("the page has as many bytes of pictures as it can hold")
-        with self._log.translated():
-            data = await self._log.blobs.read_blob(content.hash)
-        if data is None:
-            raise ValueError("its content is not in the log")
+        data = await observed_images.read_content(self._log, content)
         make = self._cloud if content.kind == "points" else self._picture
         made, size, text = await asyncio.to_thread(make, content, data)
         self._left -= size

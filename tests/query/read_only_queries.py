@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
-from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits
+from pycrorm_async.query import sql as read_only_sql
+from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import change_each
@@ -23,8 +25,8 @@ class SqlReader:
 
     def __init__(self, log: EventLog) -> None:
         self.is_sqlite = log.address.is_sqlite
-        self.stream = ReadOnlySql(log).stream
-        self._query = ReadOnlySql(log).query
+        self.stream = partial(read_only_sql.stream, log)
+        self._query = partial(read_only_sql.query, log)
 
     async def query(self, text: str, limits: SqlLimits = DEFAULT_LIMITS) -> tuple[tuple[str, ...], list[Any], bool]:
         result = await self._query(text, limits)

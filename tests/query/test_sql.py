@@ -16,7 +16,7 @@ import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.sql import ReadOnlySql, SqlLimits, SqlResult, json_rows
+from pycrorm_async.query.sql import SqlLimits, SqlResult, json_rows, query
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import OWNER_GRANTS
@@ -360,7 +360,7 @@ async def test_a_query_on_a_file_that_is_gone_is_unavailable(tmp_path: Path) -> 
     for each in tmp_path.glob("memory.db*"):
         each.unlink()
     with pytest.raises(DatabaseUnavailable):
-        await ReadOnlySql(log).query("SELECT 1")
+        await query(log, "SELECT 1")
     await log.close()
     assert list(tmp_path.iterdir()) == []
 
