@@ -7,23 +7,7 @@ from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncSession
 
-from pycrorm_async.events.types import (
-    CandidateValue,
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    JointsMoved,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
-    ObjectValue,
-    RobotValue,
-)
+from pycrorm_async.events import types as events
 from pycrorm_async.orm.base import known_classes
 from pycrorm_async.query.reading import EpisodeSession, LoadOnAccess
 from pycrorm_async.store.address import DatabaseAddress
@@ -49,30 +33,32 @@ async def fill(url: str) -> None:
     """Record that a robot drives (with a motion inside), picks up the milk, and opens the fridge, in one episode."""
     script = Script()
     put = script.put
-    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    robot = put(ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))  # 3
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 4
-    fridge = put(ObjectAdded("fridge", "ENVIRONMENT", pose()))  # 5
-    state = RobotValue(pose(0.5, 0, 0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot, robot))
-    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))  # 6
-    put(LocationResolved("CostmapLocation", (CandidateValue(pose(7, 8), ("LEFT",)),), 0, 9, drive))  # 7
-    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))  # 8
-    put(NodeEnded(move, "SUCCEEDED"))  # 9
-    put(NodeEnded(drive, "SUCCEEDED"))  # 10
-    seen = ObjectReference(milk, milk)
+    put(events.EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
+    root = put(events.NodeStarted("root"))  # 2
+    robot = put(events.ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))  # 3
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 4
+    fridge = put(events.ObjectAdded("fridge", "ENVIRONMENT", pose()))  # 5
+    state = events.RobotValue(pose(0.5, 0, 0, turned=0.6), "ROBOT", 0.25, events.ObjectReference(robot, robot))
+    drive = put(events.NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))  # 6
+    put(events.LocationResolved("CostmapLocation", (events.CandidateValue(pose(7, 8), ("LEFT",)),), 0, 9, drive))  # 7
+    move = put(events.NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))  # 8
+    put(events.NodeEnded(move, "SUCCEEDED"))  # 9
+    put(events.NodeEnded(drive, "SUCCEEDED"))  # 10
+    seen = events.ObjectReference(milk, milk)
     grasp = {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", root, name_of(PICK_UP), grasp, state))  # 11
-    put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))  # 12
-    put(ObjectAttached(ObjectReference(robot, robot), seen, "l_gripper_tool_frame", pick))  # 13
-    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far", ["LEFT"])))  # 14
-    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1), ObjectReference(fridge, fridge))
-    put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "RIGHT"}, None))  # 15
+    pick = put(events.NodeStarted("action", root, name_of(PICK_UP), grasp, state))  # 11
+    put(events.ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))  # 12
+    put(events.ObjectAttached(events.ObjectReference(robot, robot), seen, "l_gripper_tool_frame", pick))  # 13
+    put(events.NodeEnded(pick, "FAILED", events.FailureValue("plan.failures.IKError", "too far", ["LEFT"])))  # 14
+    handle = events.ObjectValue(
+        "ObjectPart", "handle", "GENERIC_OBJECT", pose(1), events.ObjectReference(fridge, fridge)
+    )
+    put(events.NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "RIGHT"}, None))  # 15
     joints = {"names": ["a", "b"], "positions": [0.5, -1.0]}
-    put(NodeStarted("motion", root, name_of(MOVE_JOINTS), joints, state))  # 16
-    put(JointsMoved(ObjectReference(robot, robot), {"a": 0.5}, root))  # 17
-    put(ObjectRemoved(seen))  # 18
-    put(EpisodeEnded("LOST"))  # 19
+    put(events.NodeStarted("motion", root, name_of(MOVE_JOINTS), joints, state))  # 16
+    put(events.JointsMoved(events.ObjectReference(robot, robot), {"a": 0.5}, root))  # 17
+    put(events.ObjectRemoved(seen))  # 18
+    put(events.EpisodeEnded("LOST"))  # 19
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, MOVE, OPEN, MOVE_JOINTS), *script.records])
     await log.close()

@@ -13,20 +13,9 @@ from sqlalchemy import event, inspect, select
 from sqlalchemy.ext.hybrid import HybridExtensionType
 from sqlalchemy.orm import selectinload, undefer
 
-from pycrorm_async import Memory
+from pycrorm_async import Memory, orm
 from pycrorm_async.errors import CallerError, DatabaseUnavailable
 from pycrorm_async.events.types import NodeStarted, RobotValue
-from pycrorm_async.orm import (
-    Action,
-    Base,
-    LocationResolution,
-    NavigateAction,
-    Object,
-    PickUpWithContextView,
-    ProcessMetaData,
-    TaskTreeNode,
-    base,
-)
 from pycrorm_async.plan import TransportAction, simulated_robot
 from pycrorm_async.query.reading import LoadOnAccess, Reading
 from pycrorm_async.store.log import EventLog
@@ -69,7 +58,7 @@ def statements(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 async def actions_of(reading: Reading) -> list[Any]:
     async with reading.session() as session:
-        return list((await session.scalars(select(Action).order_by(Action.id))).all())
+        return list((await session.scalars(select(orm.Action).order_by(orm.Action.id))).all())
 
 
 def selects(statements: list[str], table: str) -> int:
@@ -80,7 +69,7 @@ async def test_an_attribute_is_loaded_for_all_objects_of_a_query_at_once(
     statements: list[str], reading: Reading
 ) -> None:
     rows = await actions_of(reading)
-    assert [type(each) for each in rows] == [NavigateAction] * _COUNT
+    assert [type(each) for each in rows] == [orm.NavigateAction] * _COUNT
     assert not statements
     assert [each.target_location_id is not None for each in rows] == [True] * _COUNT
     assert len([each for each in statements if "navigate_action" in each]) == 1
@@ -90,7 +79,7 @@ async def test_an_attribute_is_loaded_for_all_objects_of_a_query_at_once(
 
 
 async def test_a_batch_is_bounded(statements: list[str], reading: Reading, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(base, "BATCH", 2)
+    monkeypatch.setattr(orm.base, "BATCH", 2)
     rows = await actions_of(reading)
     assert [each.pose_id is not None for each in rows] == [True] * _COUNT
     assert len([each for each in statements if "navigate_action" in each]) == 3
@@ -115,7 +104,7 @@ async def test_an_object_that_was_loaded_on_access_loads_what_is_read_of_it(read
 async def test_a_closed_session_is_freed_with_its_last_object(reading: Reading) -> None:
     async with reading.session() as session:
         session.expunge_all()
-        row = (await session.scalars(select(Action).order_by(Action.id).limit(1))).one()
+        row = (await session.scalars(select(orm.Action).order_by(orm.Action.id).limit(1))).one()
         kept = weakref.ref(session.sync_session)
     del session
     gc.collect()
@@ -131,9 +120,9 @@ async def test_an_attribute_is_read_between_the_rows_of_an_open_session(reading:
         places = [
             (
                 each.robot_state and each.robot_state.pose.x,
-                (await session.get_one(TaskTreeNode, each.id)).action is each,
+                (await session.get_one(orm.TaskTreeNode, each.id)).action is each,
             )
-            async for each in await session.stream_scalars(select(Action).order_by(Action.id))
+            async for each in await session.stream_scalars(select(orm.Action).order_by(orm.Action.id))
         ]
     assert places == [(number, True) for number in range(_COUNT)]
 
@@ -162,7 +151,7 @@ async def test_a_database_that_is_away_is_named_when_an_attribute_is_read(
 
 CLASSES = [
     each.class_
-    for each in sorted(Base.registry.mappers, key=str)
+    for each in sorted(orm.Base.registry.mappers, key=str)
     if each.class_.__module__.startswith("pycrorm_async.orm")
 ]
 ON_REQUEST = {"children", "ancestors", "node", "parameters", "refusals", "description", "robots", "outcome"}
@@ -171,7 +160,7 @@ ON_REQUEST_OF_PICK_UPS |= {f"robot_in_{name}" for name in ON_REQUEST_OF_PICK_UPS
 ON_REQUEST_OF_PICK_UPS |= {"policy", "robot", "scene"}
 
 
-def attributes(row: Base) -> set[str]:
+def attributes(row: orm.Base) -> set[str]:
     """Return the names of all columns, relationships, synonyms, hybrids and properties of a row's class."""
     mapper = inspect(row).mapper
     mapped = {name for name, each in mapper.all_orm_descriptors.items() if hasattr(type(row), name)}
@@ -186,7 +175,7 @@ def attributes(row: Base) -> set[str]:
     return {name for name in mapped | hybrids | properties if not name.startswith("_")} - {"awaitable_attrs"}
 
 
-def unloaded(row: Base, seen: set[int], depth: int) -> set[tuple[str, str]]:
+def unloaded(row: orm.Base, seen: set[int], depth: int) -> set[tuple[str, str]]:
     """Read every attribute of a row and of the rows it leads to; return those that raise `CallerError`."""
     names: set[tuple[str, str]] = set()
     if id(row) in seen or depth < 0:
@@ -199,7 +188,7 @@ def unloaded(row: Base, seen: set[int], depth: int) -> set[tuple[str, str]]:
             names.add((type(row).__name__, name if f"`await row.awaitable_attrs.{name}`" in str(error) else str(error)))
             continue
         for each in value if isinstance(value, list) else [value]:
-            if isinstance(each, Base):
+            if isinstance(each, orm.Base):
                 names |= unloaded(each, seen, depth - 1)
     return names
 
@@ -234,7 +223,7 @@ async def test_every_attribute_is_loaded_or_its_error_names_how_to_load_it(
             after = {name for row in rows for _, name in unloaded(row, set(), depth=3)}
             assert in_session == after, class_
             on_request |= in_session
-            expected = ON_REQUEST | (ON_REQUEST_OF_PICK_UPS if class_ is PickUpWithContextView else set())
+            expected = ON_REQUEST | (ON_REQUEST_OF_PICK_UPS if class_ is orm.PickUpWithContextView else set())
             assert in_session <= expected, class_
     assert on_request == ON_REQUEST | ON_REQUEST_OF_PICK_UPS
     assert {"TransportAction", "Object", "LocationResolution", "Attachment", "TaskTreeNode", "MoveMotion"} <= with_rows
@@ -249,16 +238,16 @@ async def test_attributes_on_request_are_loaded_as_the_error_advises(
     async with Memory.open(database_url) as memory:
         await transport(memory)
         cases: list[tuple[Any, str, Any]] = [
-            (TaskTreeNode, "parent", selectinload(TaskTreeNode.parent)),
-            (Action, "robot_state", selectinload(Action.robot_state)),
-            (TaskTreeNode, "children", selectinload(TaskTreeNode.children)),
-            (Object, "node", selectinload(Object.node)),
-            (Action, "node", selectinload(Action.node)),
-            (Action, "parameters", undefer(Action.parameters)),
-            (ProcessMetaData, "robots", selectinload(ProcessMetaData.robots)),
-            (LocationResolution, "refusals", selectinload(LocationResolution.refusals)),
-            (TaskTreeNode, "outcome", undefer(TaskTreeNode.outcome)),
-            (PickUpWithContextView, "robot_in_object_z", undefer(PickUpWithContextView.robot_in_object_z)),
+            (orm.TaskTreeNode, "parent", selectinload(orm.TaskTreeNode.parent)),
+            (orm.Action, "robot_state", selectinload(orm.Action.robot_state)),
+            (orm.TaskTreeNode, "children", selectinload(orm.TaskTreeNode.children)),
+            (orm.Object, "node", selectinload(orm.Object.node)),
+            (orm.Action, "node", selectinload(orm.Action.node)),
+            (orm.Action, "parameters", undefer(orm.Action.parameters)),
+            (orm.ProcessMetaData, "robots", selectinload(orm.ProcessMetaData.robots)),
+            (orm.LocationResolution, "refusals", selectinload(orm.LocationResolution.refusals)),
+            (orm.TaskTreeNode, "outcome", undefer(orm.TaskTreeNode.outcome)),
+            (orm.PickUpWithContextView, "robot_in_object_z", undefer(orm.PickUpWithContextView.robot_in_object_z)),
         ]
         for class_, name, option in cases:
             async with memory.session() as session:

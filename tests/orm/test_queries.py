@@ -10,56 +10,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
+from pycrorm_async import orm
+from pycrorm_async.events import types as events
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import (
-    CandidateValue,
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectMoved,
-    ObjectReference,
-    ObjectValue,
-    RefusalValue,
-    RobotValue,
-)
-from pycrorm_async.orm import (
-    Action,
-    Attachment,
-    Base,
-    BelieveObject,
-    Concept,
-    ConceptAncestor,
-    Designator,
-    EpisodeTag,
-    JointChange,
-    LocationCandidate,
-    LocationRefusal,
-    LocationResolution,
-    Motion,
-    MoveJointsMotion,
-    MoveMotion,
-    NavigateAction,
-    Object,
-    ObjectConcept,
-    ObjectPart,
-    ObjectRemoval,
-    OpenAction,
-    ParameterItem,
-    PickUpAction,
-    PickUpWithContextView,
-    Pose,
-    Position,
-    ProcessMetaData,
-    Quaternion,
-    RobotState,
-    RootFailure,
-    SpatialRelation,
-    TaskTreeNode,
-)
 from pycrorm_async.orm.base import UtcTime
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.projector import Projector
@@ -91,21 +44,26 @@ pytestmark = pytest.mark.slow
 
 named = [getattr(pycrorm_async.orm, each) for each in dir(pycrorm_async.orm)]
 CLASSES = sorted(
-    (each for each in named if isinstance(each, type) and issubclass(each, Base)),
+    (each for each in named if isinstance(each, type) and issubclass(each, orm.Base)),
     key=lambda each: each.__name__,
 )
 
 
 async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     await Projector(log).open()
-    always_filled = (Base, Concept, ConceptAncestor, ObjectConcept)  # the concepts belong to the program
+    always_filled = (
+        orm.Base,
+        orm.Concept,
+        orm.ConceptAncestor,
+        orm.ObjectConcept,
+    )  # the concepts belong to the program
     mapped = [each for each in CLASSES if each not in always_filled]
     assert len(mapped) > 50
     assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
 async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -> None:
-    (metadata,) = await every(breakfast, select(ProcessMetaData))
+    (metadata,) = await every(breakfast, select(orm.ProcessMetaData))
     assert repr(metadata) == (
         "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
         f" created_at={moment(1)!r}, created_by='me', description='Tutorial', version='1.0', host='host',"
@@ -118,40 +76,42 @@ async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -
 async def test_rows_are_joined_along_their_relationships_and_names_of_the_thesis(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
         for question, rows in (
-            (select(ProcessMetaData.pycram_version).where(ProcessMetaData.pycram_version == "1.0"), [("1.0",)]),
+            (select(orm.ProcessMetaData.pycram_version).where(orm.ProcessMetaData.pycram_version == "1.0"), [("1.0",)]),
             (
-                select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode),
+                select(orm.ProcessMetaData.description, orm.PickUpAction.duration).join(orm.PickUpAction.episode),
                 [("Tutorial", 3.0)],
             ),
             (
-                select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == "LEFT"),
+                select(orm.PickUpAction.arm, orm.TaskTreeNode.status)
+                .join(orm.PickUpAction.node)
+                .where(orm.PickUpAction.arm == "LEFT"),
                 [(Arms.LEFT, TaskStatus.FAILED)],
             ),
             (
-                select(TaskTreeNode.id)
-                .join(TaskTreeNode.action.of_type(PickUpAction))
-                .where(PickUpAction.arm == Arms.LEFT),
+                select(orm.TaskTreeNode.id)
+                .join(orm.TaskTreeNode.action.of_type(orm.PickUpAction))
+                .where(orm.PickUpAction.arm == Arms.LEFT),
                 [(row(11),)],
             ),
             (
-                select(Position.x, Quaternion.z)
-                .select_from(NavigateAction)
-                .join(NavigateAction.robot_state)
-                .join(RobotState.pose)
-                .join(Pose.position)
-                .join(Pose.orientation),
+                select(orm.Position.x, orm.Quaternion.z)
+                .select_from(orm.NavigateAction)
+                .join(orm.NavigateAction.robot_state)
+                .join(orm.RobotState.pose)
+                .join(orm.Pose.position)
+                .join(orm.Pose.orientation),
                 [(0.5, 0.6)],
             ),
             *(  # the pose of the object at execution, and not after it has moved
-                (select(Pose.x, Pose.z).join(picked).join(Object.pose), [(1.0, 3.0)])
-                for picked in (PickUpAction.object, PickUpAction.object_designator)
+                (select(orm.Pose.x, orm.Pose.z).join(picked).join(orm.Object.pose), [(1.0, 3.0)])
+                for picked in (orm.PickUpAction.object, orm.PickUpAction.object_designator)
             ),
         ):
             assert list(map(tuple, await session.execute(question))) == rows
 
 
 async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) -> None:
-    (drive,) = await every(breakfast, select(NavigateAction))
+    (drive,) = await every(breakfast, select(orm.NavigateAction))
     assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
     state = drive.robot_state
     assert (state.torso_height, state.type, state.pose_id) == (0.25, ObjectType.ROBOT, row(6, 1))
@@ -165,17 +125,17 @@ async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) ->
 
 
 async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog) -> None:
-    actions = await every(breakfast, select(Action).order_by(Action.id))
-    assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
+    actions = await every(breakfast, select(orm.Action).order_by(orm.Action.id))
+    assert [type(each) for each in actions] == [orm.NavigateAction, orm.PickUpAction, orm.OpenAction]
     assert actions[1].arm is Arms.LEFT
     assert actions[1].grasp is Grasp.TOP
     assert actions[1].object.pose.position.z == 3.0
     assert actions[2].robot_state is None
-    motions = await every(breakfast, select(Motion).order_by(Motion.id))
-    assert [type(each) for each in motions] == [MoveMotion, MoveJointsMotion]
+    motions = await every(breakfast, select(orm.Motion).order_by(orm.Motion.id))
+    assert [type(each) for each in motions] == [orm.MoveMotion, orm.MoveJointsMotion]
     assert motions[0].robot_state.pose.position.x == 0.5
     assert (motions[1].names, motions[1].positions) == (["a", "b"], [0.5, -1.0])
-    designators = await every(breakfast, select(Designator).order_by(Designator.id))
+    designators = await every(breakfast, select(orm.Designator).order_by(orm.Designator.id))
     assert [type(each).__name__ for each in designators] == [
         "NavigateAction", "MoveMotion", "PickUpAction", "OpenAction", "MoveJointsMotion",
     ]  # fmt: skip
@@ -183,7 +143,7 @@ async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog)
 
 
 async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: EventLog) -> None:
-    nodes = {each.id: each for each in await every(breakfast, select(TaskTreeNode))}
+    nodes = {each.id: each for each in await every(breakfast, select(orm.TaskTreeNode))}
     assert sorted(nodes) == [row(2), row(6), row(8), row(11), row(15), row(16)]
     pick = nodes[row(11)]
     assert (pick.status, pick.reason, pick.failure_message) == (TaskStatus.FAILED, "IKError", "too far")
@@ -194,57 +154,59 @@ async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: Even
     assert nodes[row(2)].action is None
     assert nodes[row(8)].parent.action.target_location.position.x == 7.0
     assert (nodes[row(15)].status, nodes[row(15)].end_time) == (TaskStatus.LOST, None)
-    lost = select(TaskTreeNode.id).where(TaskTreeNode.status == TaskStatus.LOST).order_by(TaskTreeNode.id)
+    lost = select(orm.TaskTreeNode.id).where(orm.TaskTreeNode.status == TaskStatus.LOST).order_by(orm.TaskTreeNode.id)
     assert await every(breakfast, lost) == [row(2), row(15), row(16)]
 
 
 async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
-        move = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.id == row(8)))).one()
+        move = (await session.scalars(select(orm.TaskTreeNode).where(orm.TaskTreeNode.id == row(8)))).one()
         ancestors = await move.awaitable_attrs.ancestors
         assert [each.id for each in ancestors] == [row(6), row(2)]
         children = await ancestors[1].awaitable_attrs.children
         assert [each.id for each in children] == [row(6), row(11), row(15), row(16)]
         assert [each.id for each in ancestors[1].children] == [row(6), row(11), row(15), row(16)]
         assert await move.awaitable_attrs.children == []
-        around = select(TaskTreeNode.id).where(TaskTreeNode.children.any(dtype="MoveMotion"))
+        around = select(orm.TaskTreeNode.id).where(orm.TaskTreeNode.children.any(dtype="MoveMotion"))
         assert (await session.scalars(around)).all() == [row(6)]
-        milk = (await session.scalars(select(Object).where(Object.id == row(12)))).one()
+        milk = (await session.scalars(select(orm.Object).where(orm.Object.id == row(12)))).one()
         assert (await milk.awaitable_attrs.node).action.dtype == "PickUpAction"
     drive, root = row(6), row(2)
-    question = select(TaskTreeNode).where(TaskTreeNode.id == root).options(selectinload(TaskTreeNode.children))
+    question = (
+        select(orm.TaskTreeNode).where(orm.TaskTreeNode.id == root).options(selectinload(orm.TaskTreeNode.children))
+    )
     (node,) = await every(breakfast, question)
     assert (node.children[0].id, node.children[0].action.dtype) == (drive, "NavigateAction")
-    moved = await every(breakfast, select(Object).options(selectinload(Object.node)).order_by(Object.id))
+    moved = await every(breakfast, select(orm.Object).options(selectinload(orm.Object.node)).order_by(orm.Object.id))
     assert [each.node and each.node.id for each in moved if each.name == "milk"] == [None, row(11)]
 
 
 async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakfast: EventLog) -> None:
-    milk = await every(breakfast, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
+    milk = await every(breakfast, select(orm.Object).where(orm.Object.identity_id == row(4)).order_by(orm.Object.id))
     assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
         (row(4), 1.0, None),
         (row(12), 9.0, row(11)),
     ]
-    (handle,) = await every(breakfast, select(ObjectPart))
+    (handle,) = await every(breakfast, select(orm.ObjectPart))
     assert (handle.name, handle.part_of.name, handle.pose.position.x) == ("handle", "fridge", 1.0)
-    assert await every(breakfast, select(BelieveObject)) == []
-    (robot,) = await every(breakfast, select(Object).where(Object.obj_type == ObjectType.ROBOT))
+    assert await every(breakfast, select(orm.BelieveObject)) == []
+    (robot,) = await every(breakfast, select(orm.Object).where(orm.Object.obj_type == ObjectType.ROBOT))
     assert robot.joints == {"torso": 0.25}
 
 
 async def test_the_changes_of_objects_can_be_queried(breakfast: EventLog) -> None:
-    (held,) = await every(breakfast, select(Attachment))
+    (held,) = await every(breakfast, select(orm.Attachment))
     assert (held.kind, held.parent.name, held.child.name, held.link) == (
         "attached", "pr2", "milk", "l_gripper_tool_frame",
     )  # fmt: skip
-    (turned,) = await every(breakfast, select(JointChange))
+    (turned,) = await every(breakfast, select(orm.JointChange))
     assert (turned.joint, turned.position, turned.object.name, turned.time) == ("a", 0.5, "pr2", moment(17))
-    (gone,) = await every(breakfast, select(ObjectRemoval))
+    (gone,) = await every(breakfast, select(orm.ObjectRemoval))
     assert (gone.object.name, gone.identity_id, gone.node_id) == ("milk", row(4), None)
 
 
 async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> None:
-    (resolved,) = await every(breakfast, select(LocationResolution))
+    (resolved,) = await every(breakfast, select(orm.LocationResolution))
     assert (resolved.location, resolved.considered, resolved.offered, resolved.taken) == ("CostmapLocation", 9, 1, 0)
     assert (resolved.pose.position.x, resolved.node.action.dtype) == (7.0, "NavigateAction")
     assert [(each.x, each.reachable_arms, each.taken) for each in resolved.candidates] == [(7.0, [Arms.LEFT], True)]
@@ -252,10 +214,10 @@ async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> No
 
 async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
-        pick = (await session.scalars(select(PickUpAction))).one()
+        pick = (await session.scalars(select(orm.PickUpAction))).one()
         awaited_parameters = await pick.awaitable_attrs.parameters
         assert awaited_parameters == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
-    (joints,) = await every(breakfast, select(MoveJointsMotion).options(undefer(MoveJointsMotion.parameters)))
+    (joints,) = await every(breakfast, select(orm.MoveJointsMotion).options(undefer(orm.MoveJointsMotion.parameters)))
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
 
 
@@ -263,16 +225,16 @@ async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an
     log: EventLog,
 ) -> None:
     script = Script()
-    milk = script.put(ObjectAdded("milk", "OAT_MILK", pose()))
-    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "THIRD", "grasp": "TOP"}
-    script.put(NodeStarted("action", None, name_of(PICK_UP), parameters))
+    milk = script.put(events.ObjectAdded("milk", "OAT_MILK", pose()))
+    parameters = {"object_designator": events.ObjectReference(milk, milk), "arm": "THIRD", "grasp": "TOP"}
+    script.put(events.NodeStarted("action", None, name_of(PICK_UP), parameters))
     await stored_and_folded(log, [*declarations(PICK_UP), *script.records])
-    (pick,) = await every(log, select(PickUpAction))
+    (pick,) = await every(log, select(orm.PickUpAction))
     assert (pick.arm, pick.grasp, pick.object.obj_type) == (Arms.named("THIRD"), Grasp.TOP, "OAT_MILK")
 
 
 async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: EventLog) -> None:
-    later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
+    later = select(orm.TaskTreeNode.id).where(orm.TaskTreeNode.start_time > moment(11)).order_by(orm.TaskTreeNode.id)
     assert await every(breakfast, later) == [row(15), row(16)]
     with pytest.raises(ValueError, match="has no time zone"):
         UtcTime().process_bind_param(datetime(2026, 1, 1), None)  # type: ignore[arg-type]  # noqa: DTZ001  the point
@@ -286,7 +248,7 @@ async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: Event
 WAIT = declared("WaitAction", "orm_wait", field("duration", "real", 2), field("status", "text", 3))
 
 
-class ORMWait(Action):
+class ORMWait(orm.Action):
     """A class whose fields have the names of attributes that every action has."""
 
     __tablename__ = "orm_wait"
@@ -296,22 +258,22 @@ class ORMWait(Action):
 
 
 async def test_an_action_has_its_times_and_its_outcome_also_in_filters(breakfast: EventLog) -> None:
-    drive, pick, opening = await every(breakfast, select(Action).order_by(Action.start_time))
+    drive, pick, opening = await every(breakfast, select(orm.Action).order_by(orm.Action.start_time))
     assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
     assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
     assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
     assert (opening.status, opening.end_time, opening.duration) == (TaskStatus.LOST, None, None)
     assert pick.episode is pick.process_metadata
     for condition, sequences in (
-        (Action.status == TaskStatus.FAILED, [11]),
-        (Action.duration >= 3, [6, 11]),
-        (Action.end_time.is_(None), [15]),
-        (Action.start_time > moment(6), [11, 15]),
-        (Action.reason == "IKError", [11]),
-        (Action.episode.has(description="Tutorial"), [6, 11, 15]),
-        (Action.sequence == 6, [6]),
+        (orm.Action.status == TaskStatus.FAILED, [11]),
+        (orm.Action.duration >= 3, [6, 11]),
+        (orm.Action.end_time.is_(None), [15]),
+        (orm.Action.start_time > moment(6), [11, 15]),
+        (orm.Action.reason == "IKError", [11]),
+        (orm.Action.episode.has(description="Tutorial"), [6, 11, 15]),
+        (orm.Action.sequence == 6, [6]),
     ):
-        in_order = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
+        in_order = select(orm.Action.id).where(condition).order_by(orm.Action.duration.is_(None), orm.Action.start_time)
         assert await every(breakfast, in_order) == [row(each) for each in sequences]
 
 
@@ -327,12 +289,12 @@ async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(brea
 
 async def test_a_field_with_the_name_of_an_action_attribute_hides_it(log: EventLog) -> None:
     script = Script()
-    node = script.put(NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
-    script.put(NodeEnded(node, "SUCCEEDED"))
+    node = script.put(events.NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
+    script.put(events.NodeEnded(node, "SUCCEEDED"))
     await stored_and_folded(log, [*declarations(WAIT), *script.records])
-    (wait,) = await every(log, select(ORMWait).where(ORMWait.duration > 50, Action.duration < 50))
+    (wait,) = await every(log, select(ORMWait).where(ORMWait.duration > 50, orm.Action.duration < 50))
     assert (wait.duration, wait.status, wait.reason) == (60.0, "patient", None)
-    assert await every(log, select(Action.duration)) == [1.0]
+    assert await every(log, select(orm.Action.duration)) == [1.0]
 
 
 # === event of rows ============================================================================================
@@ -344,14 +306,14 @@ SETS = declared("SetAction", "set_action", field("things", "list", 2, item="obje
 WITHOUT_EVENT = {"process_metadata", "position", "quaternion"}
 """The views of episodes, and of the parts of a pose."""
 EVENTS: dict[Any, int] = {
-    EpisodeTag: 1,
-    LocationCandidate: 5,
-    LocationRefusal: 5,
-    ParameterItem: 6,
-    PickUpAction: 7,
-    PickUpWithContextView: 7,
-    RootFailure: 7,
-    SpatialRelation: 7,
+    orm.EpisodeTag: 1,
+    orm.LocationCandidate: 5,
+    orm.LocationRefusal: 5,
+    orm.ParameterItem: 6,
+    orm.PickUpAction: 7,
+    orm.PickUpWithContextView: 7,
+    orm.RootFailure: 7,
+    orm.SpatialRelation: 7,
 }
 
 
@@ -360,23 +322,23 @@ async def filled(log: EventLog) -> EventLog:
     """The log of an episode with a tag and a failed pick-up of milk beside a bowl."""
     script = Script()
     put = script.put
-    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", tags=("kitchen",)))
-    root = put(NodeStarted("root"))
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 1)))
-    put(ObjectAdded("bowl", "BOWL", pose(1.15, 2, 1)))
-    offered, refused = (CandidateValue(pose(7, 8), ("LEFT",)),), (RefusalValue(pose(8, 8), "too far"),)
-    put(LocationResolved("CostmapLocation", offered, 0, 9, root, refused))
-    seen, state = ObjectReference(milk, milk), RobotValue(pose(0.5), "ROBOT", 0.25)
-    put(NodeStarted("action", root, name_of(SETS), {"things": [seen], "sequence": 70}, state))
+    put(events.EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", tags=("kitchen",)))
+    root = put(events.NodeStarted("root"))
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1, 2, 1)))
+    put(events.ObjectAdded("bowl", "BOWL", pose(1.15, 2, 1)))
+    offered, refused = (events.CandidateValue(pose(7, 8), ("LEFT",)),), (events.RefusalValue(pose(8, 8), "too far"),)
+    put(events.LocationResolved("CostmapLocation", offered, 0, 9, root, refused))
+    seen, state = events.ObjectReference(milk, milk), events.RobotValue(pose(0.5), "ROBOT", 0.25)
+    put(events.NodeStarted("action", root, name_of(SETS), {"things": [seen], "sequence": 70}, state))
     parameters = {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", root, name_of(PICK_UP), parameters, state))
-    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far")))
+    pick = put(events.NodeStarted("action", root, name_of(PICK_UP), parameters, state))
+    put(events.NodeEnded(pick, "FAILED", events.FailureValue("plan.failures.IKError", "too far")))
     await stored_and_folded(log, [*declarations(PICK_UP, PLACE, SETS), *script.records])
     return log
 
 
 async def test_every_view_and_class_of_what_happened_has_the_event_of_its_rows(filled: EventLog) -> None:
-    tables = {mapper.class_.__tablename__: mapper.class_ for mapper in Base.registry.mappers}
+    tables = {mapper.class_.__tablename__: mapper.class_ for mapper in orm.Base.registry.mappers}
     async with filled.engine.connect() as connection:
         generation = await current_generation(connection)
         assert generation is not None
@@ -407,39 +369,39 @@ def failing() -> Script:
     """A transport fails in a motion of its second attempt, and the plan continues; then the plan itself raises."""
     script = Script()
     put = script.put
-    put(EpisodeStarted("Breakfast", "me", "host", "1.0", "3.11"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
-    retry = put(NodeStarted("language", root, name_of(RETRY), {"times": 2}))  # 4
+    put(events.EpisodeStarted("Breakfast", "me", "host", "1.0", "3.11"))  # 1
+    root = put(events.NodeStarted("root"))  # 2
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
+    retry = put(events.NodeStarted("language", root, name_of(RETRY), {"times": 2}))  # 4
     for arm in ("LEFT", "RIGHT"):  # 5 to 9, 10 to 14
-        seen = {"object_designator": ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
-        pick = put(NodeStarted("action", retry, name_of(PICK_UP), seen))
-        move = put(NodeStarted("motion", pick, name_of(MOVE), {"target": pose(7, 8)}))
-        put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), move))
-        fault = FailureValue("plan.failures.IKError", f"{arm} is too short", [])
-        put(NodeEnded(move, "FAILED", fault))
-        put(NodeEnded(pick, "FAILED", fault))
-    put(NodeEnded(retry, "SUCCEEDED"))  # 15
-    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1))
-    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 16
-    put(NodeEnded(opening, "CANCELLED"))  # 17
-    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}))  # 18
-    put(NodeEnded(drive, "SUCCEEDED"))  # 19
-    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 20
-    put(NodeEnded(opening, "ERROR", FailureValue("builtins.KeyError", "door")))  # 21
-    put(NodeEnded(root, "ERROR", FailureValue("builtins.KeyError", "door")))  # 22
-    put(EpisodeEnded("ERROR"))  # 23
+        seen = {"object_designator": events.ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
+        pick = put(events.NodeStarted("action", retry, name_of(PICK_UP), seen))
+        move = put(events.NodeStarted("motion", pick, name_of(MOVE), {"target": pose(7, 8)}))
+        put(events.ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), move))
+        fault = events.FailureValue("plan.failures.IKError", f"{arm} is too short", [])
+        put(events.NodeEnded(move, "FAILED", fault))
+        put(events.NodeEnded(pick, "FAILED", fault))
+    put(events.NodeEnded(retry, "SUCCEEDED"))  # 15
+    handle = events.ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1))
+    opening = put(events.NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 16
+    put(events.NodeEnded(opening, "CANCELLED"))  # 17
+    drive = put(events.NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}))  # 18
+    put(events.NodeEnded(drive, "SUCCEEDED"))  # 19
+    opening = put(events.NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 20
+    put(events.NodeEnded(opening, "ERROR", events.FailureValue("builtins.KeyError", "door")))  # 21
+    put(events.NodeEnded(root, "ERROR", events.FailureValue("builtins.KeyError", "door")))  # 22
+    put(events.EpisodeEnded("ERROR"))  # 23
     put = (second := Script(2)).put
-    put(EpisodeStarted("Lunch", "me", "host", "1.0", "3.11"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    put(NodeEnded(root, "ERROR", FailureValue("builtins.ValueError", "no table")))  # 3
+    put(events.EpisodeStarted("Lunch", "me", "host", "1.0", "3.11"))  # 1
+    root = put(events.NodeStarted("root"))  # 2
+    put(events.NodeEnded(root, "ERROR", events.FailureValue("builtins.ValueError", "no table")))  # 3
     script.records += second.records
     return script
 
 
 async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
-    first, second, opening, plan = await every(log, select(RootFailure).order_by(RootFailure.id))
+    first, second, opening, plan = await every(log, select(orm.RootFailure).order_by(orm.RootFailure.id))
     path = "root > Retry > PickUpAction > MoveMotion"
     assert (first.id, first.dtype, first.status) == (row(6), "MoveMotion", TaskStatus.FAILED)
     assert (first.path, first.object, first.arm) == (path, "milk", Arms.LEFT)
@@ -451,20 +413,20 @@ async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_messa
     assert (opening.message, opening.recovered) == ("door", False)
     assert (plan.id, plan.dtype, plan.path, plan.object) == (row(2, number=2), None, "root", None)
     assert (plan.arm, plan.message, plan.recovered) == (None, "no table", False)
-    lost = select(RootFailure.path).where(~RootFailure.recovered, RootFailure.object == "handle")
+    lost = select(orm.RootFailure.path).where(~orm.RootFailure.recovered, orm.RootFailure.object == "handle")
     assert await every(log, lost) == ["root > OpenAction"]
 
 
 async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: EventLog) -> None:
     script = Script()
     put = script.put
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
-    seen = {"object_designator": ObjectReference(milk, milk), "arm": "RIGHT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", None, name_of(PICK_UP), seen))
-    handle = {"object_designator": ObjectValue("ObjectPart", "handle"), "arm": "LEFT"}
-    opening = put(NodeStarted("action", pick, name_of(OPEN), handle))
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    seen = {"object_designator": events.ObjectReference(milk, milk), "arm": "RIGHT", "grasp": "TOP"}
+    pick = put(events.NodeStarted("action", None, name_of(PICK_UP), seen))
+    handle = {"object_designator": events.ObjectValue("ObjectPart", "handle"), "arm": "LEFT"}
+    opening = put(events.NodeStarted("action", pick, name_of(OPEN), handle))
     for node in (opening, pick):
-        put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
+        put(events.NodeEnded(node, "FAILED", events.FailureValue("plan.failures.PlanFailure", "")))
     await stored_and_folded(log, [*declarations(PICK_UP, OPEN), *script.records])
-    (failure,) = await every(log, select(RootFailure))
+    (failure,) = await every(log, select(orm.RootFailure))
     assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)

@@ -9,25 +9,7 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    Happening,
-    JointsMoved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectDetected,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
-    PoseValue,
-    RobotValue,
-    SeenValue,
-)
+from pycrorm_async.events import types as events
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, SAYING, T0_NS, Script, declarations, name_of, pose
 
 TYPES = declarations(NAVIGATE, PICK_UP, SAYING, MOVE)
@@ -43,32 +25,32 @@ class RandomEpisode(Script):
     def __init__(self, number: int, seed: int) -> None:
         super().__init__(number)
         self.number = number
-        self.happenings: list[Happening] = []
+        self.happenings: list[events.Happening] = []
         self._dice = dice = random.Random(seed)
-        self._rows: dict[str, ObjectReference] = {}
+        self._rows: dict[str, events.ObjectReference] = {}
         tags = tuple(dice.sample(["night", "kitchen"], dice.randrange(3)))
         self.put(
-            EpisodeStarted(
+            events.EpisodeStarted(
                 f"run {number} of milk", "me", "host", "1", "3.11", plan=dice.choice(["tidy", "set"]), tags=tags
             )
         )
-        root = self.put(NodeStarted("root"))
+        root = self.put(events.NodeStarted("root"))
         for name in dice.sample(NAMES, 3):
-            added = self.put(ObjectAdded(name, dice.choice(["MILK", "BOWL"]), self._place()))
-            self._rows[name] = ObjectReference(added, added)
+            added = self.put(events.ObjectAdded(name, dice.choice(["MILK", "BOWL"]), self._place()))
+            self._rows[name] = events.ObjectReference(added, added)
         runs = number % 5 == 0
         self._children(root, dice.randrange(2, 6), depth=0, open_=runs)
         for name in [*self._rows][: dice.randrange(3)]:
-            self.put(ObjectRemoved(self._rows.pop(name), root))
+            self.put(events.ObjectRemoved(self._rows.pop(name), root))
         if not runs:
-            self.put(NodeEnded(root, "SUCCEEDED"))
-            self.put(EpisodeEnded(dice.choice(["SUCCEEDED", "FAILED"])))
+            self.put(events.NodeEnded(root, "SUCCEEDED"))
+            self.put(events.EpisodeEnded(dice.choice(["SUCCEEDED", "FAILED"])))
 
-    def put(self, event: Happening, *, version: int | None = None) -> int:
+    def put(self, event: events.Happening, *, version: int | None = None) -> int:
         self.happenings.append(event)
         return super().put(event, version=version)
 
-    def _place(self) -> PoseValue:
+    def _place(self) -> events.PoseValue:
         place = pose(self._dice.choice([0.0, 0.5, 2.0]), self._dice.choice([0.0, 1.0]), 0.9)
         return msgspec.structs.replace(place, time_ns=T0_NS + self.number)
 
@@ -85,8 +67,8 @@ class RandomEpisode(Script):
     def _node(self, parent: int, depth: int, *, ends: bool) -> bool:
         dice = self._dice
         type_ = MOVE if depth > 1 else dice.choice([NAVIGATE, PICK_UP, SAYING])
-        robot = RobotValue(self._place(), "ROBOT", dice.choice([None, 0.25]), name=dice.choice([None, "pr2"]))
-        started = NodeStarted(
+        robot = events.RobotValue(self._place(), "ROBOT", dice.choice([None, 0.25]), name=dice.choice([None, "pr2"]))
+        started = events.NodeStarted(
             "motion" if type_ is MOVE else "action",
             parent,
             name_of(type_),
@@ -100,13 +82,13 @@ class RandomEpisode(Script):
         if not ends:
             return False
         if dice.random() < (0.7 if child_failed else 0.3):
-            self.put(NodeEnded(node, dice.choice(["FAILED", "FAILED", "ERROR"]), self._failure()))
+            self.put(events.NodeEnded(node, dice.choice(["FAILED", "FAILED", "ERROR"]), self._failure()))
             return True
-        self.put(NodeEnded(node, "INTERRUPTED" if dice.random() < 0.2 else "SUCCEEDED"))
+        self.put(events.NodeEnded(node, "INTERRUPTED" if dice.random() < 0.2 else "SUCCEEDED"))
         return False
 
-    def _failure(self) -> FailureValue:
-        return FailureValue(self._dice.choice(REASONS), self._dice.choice(MESSAGES))
+    def _failure(self) -> events.FailureValue:
+        return events.FailureValue(self._dice.choice(REASONS), self._dice.choice(MESSAGES))
 
     def _parameters(self, dtype: str) -> dict[str, Any]:
         dice = self._dice
@@ -126,17 +108,17 @@ class RandomEpisode(Script):
         one, two = self._rows[first], self._rows[second]
         match dice.randrange(7):
             case 0 | 1 | 2:
-                moved = self.put(ObjectMoved(one.object, first, "MILK", self._place(), node))
-                self._rows[first] = ObjectReference(one.object, moved)
+                moved = self.put(events.ObjectMoved(one.object, first, "MILK", self._place(), node))
+                self._rows[first] = events.ObjectReference(one.object, moved)
             case 3:
-                self.put(ObjectAttached(one, two, "gripper", node))
+                self.put(events.ObjectAttached(one, two, "gripper", node))
             case 4:
-                self.put(ObjectDetached(one, two, "gripper", node))
+                self.put(events.ObjectDetached(one, two, "gripper", node))
             case 5:
-                self.put(JointsMoved(one, {"lid": dice.random(), "door": dice.random()}, node))
+                self.put(events.JointsMoved(one, {"lid": dice.random(), "door": dice.random()}, node))
             case 6:
-                seen = SeenValue(first, "MILK", self._place(), one, confidence=0.5)
-                self.put(ObjectDetected("camera", None, (seen,), node))
+                seen = events.SeenValue(first, "MILK", self._place(), one, confidence=0.5)
+                self.put(events.ObjectDetected("camera", None, (seen,), node))
 
 
 @dataclass
@@ -145,9 +127,9 @@ class Node:
 
     episode: int
     sequence: int
-    started: NodeStarted
+    started: events.NodeStarted
     end: int | None = None
-    ended: NodeEnded | None = None
+    ended: events.NodeEnded | None = None
     parent: Node | None = None
     children: list[Node] = field(default_factory=list)
     object_names: dict[int, str] = field(default_factory=dict)
@@ -202,7 +184,9 @@ class Node:
         if "object_designator" in parameters:
             return ("object", parameters["object_designator"].object)
         places = (
-            msgspec.structs.replace(each, time_ns=0) for each in parameters.values() if isinstance(each, PoseValue)
+            msgspec.structs.replace(each, time_ns=0)
+            for each in parameters.values()
+            if isinstance(each, events.PoseValue)
         )
         return (*places, parameters.get("text"))
 
@@ -240,15 +224,15 @@ def nodes_of(episodes: Iterable[RandomEpisode]) -> list[Node]:
         names: dict[int, str] = {}
         for sequence, happening in enumerate(each.happenings, 1):
             match happening:
-                case NodeStarted(parent=parent):
+                case events.NodeStarted(parent=parent):
                     own[sequence] = Node(
                         each.number, sequence, happening, parent=own.get(parent or 0), object_names=names
                     )
                     if parent is not None:
                         own[parent].children.append(own[sequence])
-                case NodeEnded(node=node):
+                case events.NodeEnded(node=node):
                     own[node].end, own[node].ended = sequence, happening
-                case ObjectAdded(name=name):
+                case events.ObjectAdded(name=name):
                     names[sequence] = name
         nodes += own.values()
     return nodes
@@ -263,29 +247,31 @@ def root_failures_of(episodes: Iterable[RandomEpisode]) -> list[Node]:
 def course_of(episode: RandomEpisode, name: str) -> list[tuple[int, str, str | None, str | None]]:
     """Return what happened to an object: sequence, what, the other object, a detail; in the order of the answer."""
     names = {
-        sequence: each.name for sequence, each in enumerate(episode.happenings, 1) if isinstance(each, ObjectAdded)
+        sequence: each.name
+        for sequence, each in enumerate(episode.happenings, 1)
+        if isinstance(each, events.ObjectAdded)
     }
     course: list[tuple[int, str, str | None, str | None]] = []
     for sequence, happening in enumerate(episode.happenings, 1):
         match happening:
-            case ObjectAdded(name=own) if own == name:
+            case events.ObjectAdded(name=own) if own == name:
                 course.append((sequence, "added", None, None))
-            case ObjectMoved(name=own) if own == name:
+            case events.ObjectMoved(name=own) if own == name:
                 course.append((sequence, "moved", None, None))
-            case ObjectRemoved(object=own) if names[own.object] == name:
+            case events.ObjectRemoved(object=own) if names[own.object] == name:
                 course.append((sequence, "removed", None, None))
             case (
-                ObjectAttached(parent=parent, child=child, link=link)
-                | ObjectDetached(parent=parent, child=child, link=link)
+                events.ObjectAttached(parent=parent, child=child, link=link)
+                | events.ObjectDetached(parent=parent, child=child, link=link)
             ):
-                attaches = isinstance(happening, ObjectAttached)
+                attaches = isinstance(happening, events.ObjectAttached)
                 if names[child.object] == name:
                     course.append((sequence, "attached" if attaches else "detached", names[parent.object], link))
                 if names[parent.object] == name:
                     course.append((sequence, "holds" if attaches else "releases", names[child.object], link))
-            case JointsMoved(object=own, joints=joints) if names[own.object] == name:
+            case events.JointsMoved(object=own, joints=joints) if names[own.object] == name:
                 course += [(sequence, "joint moved", None, joint) for joint in joints]
-            case ObjectDetected(seen=seen):
+            case events.ObjectDetected(seen=seen):
                 course += [(sequence, "detected", None, "camera") for each in seen if each.name == name]
     failed = [each for each in root_failures_of([episode]) if each.object == name]
     course += [(each.sequence, "an action failed", None, each.reason) for each in failed]

@@ -12,40 +12,10 @@ import pytest
 from sqlalchemy import Engine, Select, event, select
 from sqlalchemy.orm import selectinload, undefer
 
-from pycrorm_async import Reading
-from pycrorm_async.events.types import (
-    BlobReference,
-    CandidateValue,
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectMoved,
-    ObjectReference,
-    ObjectValue,
-    Observed,
-    RefusalValue,
-    RobotValue,
-)
+from pycrorm_async import Reading, orm
+from pycrorm_async.events import types as events
 from pycrorm_async.learning.recorded_policy import policy_contents
 from pycrorm_async.learning.rollouts import episodes_question, rollouts_question
-from pycrorm_async.orm import (
-    Action,
-    EpisodeRobot,
-    LocationResolution,
-    NavigateAction,
-    Object,
-    Observation,
-    PickUpAction,
-    PickUpWithContextView,
-    ProcessMetaData,
-    RootFailure,
-    SpatialRelation,
-    TaskTreeNode,
-)
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -88,34 +58,38 @@ def episode(number: int) -> Script:
     """An episode in which a robot navigates, fails to pick the milk up, and handles a list of objects."""
     script = Script(number)
     put = script.put
-    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))
-    root = put(NodeStarted("root"))
-    robot = put(ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
-    state = RobotValue(pose(0.5, turned=0.6), "ROBOT", 0.25, ObjectReference(robot, robot))
-    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))
-    offered, refused = (CandidateValue(pose(7, 8), ("LEFT",)),), (RefusalValue(pose(8, 8), "too far"),)
-    put(LocationResolved("CostmapLocation", offered, 0, 9, drive, refused))
-    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))
-    put(NodeEnded(move, "SUCCEEDED"))
-    put(NodeEnded(drive, "SUCCEEDED"))
-    seen = ObjectReference(milk, milk)
-    put(NodeStarted("action", root, name_of(SETS), {"things": [seen, ObjectValue("BelieveObject", "cup")]}, state))
+    put(events.EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))
+    root = put(events.NodeStarted("root"))
+    robot = put(events.ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    state = events.RobotValue(pose(0.5, turned=0.6), "ROBOT", 0.25, events.ObjectReference(robot, robot))
+    drive = put(events.NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))
+    offered, refused = (events.CandidateValue(pose(7, 8), ("LEFT",)),), (events.RefusalValue(pose(8, 8), "too far"),)
+    put(events.LocationResolved("CostmapLocation", offered, 0, 9, drive, refused))
+    move = put(events.NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))
+    put(events.NodeEnded(move, "SUCCEEDED"))
+    put(events.NodeEnded(drive, "SUCCEEDED"))
+    seen = events.ObjectReference(milk, milk)
+    put(
+        events.NodeStarted(
+            "action", root, name_of(SETS), {"things": [seen, events.ObjectValue("BelieveObject", "cup")]}, state
+        )
+    )
     rollout = {"policy": "seen", "scene": "kitchen", "seed": 69, "first": 0, "count": 1}
-    batch = put(NodeStarted("action", root, name_of(BATCH), rollout, state))
-    tried = put(NodeStarted("action", batch, name_of(TRY), {}, state))
+    batch = put(events.NodeStarted("action", root, name_of(BATCH), rollout, state))
+    tried = put(events.NodeStarted("action", batch, name_of(TRY), {}, state))
     pick = put(
-        NodeStarted(
+        events.NodeStarted(
             "action", tried, name_of(PICK_UP), {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}, state
         )
     )
-    put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))
-    too_far = FailureValue("plan.failures.IKError", "too far", ["LEFT"])
-    put(NodeEnded(pick, "FAILED", too_far))
-    put(NodeEnded(tried, "FAILED", too_far))
-    learned = put(NodeStarted("action", root, name_of(LEARN), {"policy": "learned"}, state))
-    put(Observed("policy", BlobReference("aa", "application/json", 2), learned))
-    put(EpisodeEnded("FAILED"))
+    put(events.ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))
+    too_far = events.FailureValue("plan.failures.IKError", "too far", ["LEFT"])
+    put(events.NodeEnded(pick, "FAILED", too_far))
+    put(events.NodeEnded(tried, "FAILED", too_far))
+    learned = put(events.NodeStarted("action", root, name_of(LEARN), {"policy": "learned"}, state))
+    put(events.Observed("policy", events.BlobReference("aa", "application/json", 2), learned))
+    put(events.EpisodeEnded("FAILED"))
     return script
 
 
@@ -188,7 +162,7 @@ def of_episode(class_: Any, *options: Any) -> Callable[[Reading], Coroutine[Any,
 
 async def spatial_relations(reading: Reading) -> None:
     async with reading.session() as session:
-        await session.scalars(select(SpatialRelation).where(SpatialRelation.process_metadata_id == ASKED))
+        await session.scalars(select(orm.SpatialRelation).where(orm.SpatialRelation.process_metadata_id == ASKED))
 
 
 async def the_tree(reading: Reading) -> None:
@@ -218,10 +192,10 @@ def selected(statement: Any, episode: Any) -> Callable[[Reading], Coroutine[Any,
     return read
 
 
-PICK_UPS = PickUpWithContextView
+PICK_UPS = orm.PickUpWithContextView
 PICK_UP_EPISODE = PICK_UPS.process_metadata_id
-JOINED = select(PickUpAction).join(PickUpAction.object).join(Object.pose).join(PickUpAction.node)
-ROBOTS = select(ProcessMetaData).options(selectinload(ProcessMetaData.robots))
+JOINED = select(orm.PickUpAction).join(orm.PickUpAction.object).join(orm.Object.pose).join(orm.PickUpAction.node)
+ROBOTS = select(orm.ProcessMetaData).options(selectinload(orm.ProcessMetaData.robots))
 ROLLOUTS = rollouts_question(scene="kitchen", seed=69)
 ROUNDS = episodes_question(scene="kitchen", seeds=[69], policies=["seen"])
 ARGUMENTS = {"object_history": ("milk",), "moves_of": ("milk",), "experience_at": (0.5, 0.0)}
@@ -232,24 +206,26 @@ ARGUMENTS = {"object_history": ("milk",), "moves_of": ("milk",), "experience_at"
     [
         *(pytest.param(asked(each, *ARGUMENTS.get(each, ())), id=each) for each in QUESTIONS),
         pytest.param(selected(ROLLOUTS, PICK_UP_EPISODE), id="rollouts"),
-        pytest.param(selected(ROUNDS, ProcessMetaData.id), id="episodes of rollouts"),
+        pytest.param(selected(ROUNDS, orm.ProcessMetaData.id), id="episodes of rollouts"),
         pytest.param(
-            selected(policy_contents("learned"), Observation.process_metadata_id), id="the content of a policy"
+            selected(policy_contents("learned"), orm.Observation.process_metadata_id), id="the content of a policy"
         ),
-        pytest.param(of_episode(Action), id="actions"),
-        pytest.param(of_episode(Action, undefer(Action.parameters)), id="actions with parameters"),
-        pytest.param(of_episode(NavigateAction), id="actions of a type"),
-        pytest.param(of_episode(TaskTreeNode, selectinload(TaskTreeNode.children)), id="nodes with children"),
-        pytest.param(of_episode(Object, selectinload(Object.node)), id="objects with nodes"),
-        pytest.param(of_episode(LocationResolution, selectinload(LocationResolution.refusals)), id="places"),
-        pytest.param(of_episode(EpisodeRobot), id="robots"),
-        pytest.param(selected(ROBOTS, ProcessMetaData.id), id="an episode with its robots"),
-        pytest.param(of_episode(PickUpWithContextView), id="pick-ups"),
+        pytest.param(of_episode(orm.Action), id="actions"),
+        pytest.param(of_episode(orm.Action, undefer(orm.Action.parameters)), id="actions with parameters"),
+        pytest.param(of_episode(orm.NavigateAction), id="actions of a type"),
+        pytest.param(of_episode(orm.TaskTreeNode, selectinload(orm.TaskTreeNode.children)), id="nodes with children"),
+        pytest.param(of_episode(orm.Object, selectinload(orm.Object.node)), id="objects with nodes"),
+        pytest.param(of_episode(orm.LocationResolution, selectinload(orm.LocationResolution.refusals)), id="places"),
+        pytest.param(of_episode(orm.EpisodeRobot), id="robots"),
+        pytest.param(selected(ROBOTS, orm.ProcessMetaData.id), id="an episode with its robots"),
+        pytest.param(of_episode(orm.PickUpWithContextView), id="pick-ups"),
         pytest.param(selected(select(PICK_UPS.id, PICK_UPS.object_z), PICK_UP_EPISODE), id="places of pick-ups"),
-        pytest.param(of_episode(RootFailure), id="where failures began"),
+        pytest.param(of_episode(orm.RootFailure), id="where failures began"),
         pytest.param(selected(select(PICK_UPS.scene, PICK_UPS.description), PICK_UP_EPISODE), id="scenes of pick-ups"),
         pytest.param(selected(select(PICK_UPS.policy), PICK_UP_EPISODE), id="policies of pick-ups"),
-        pytest.param(selected(JOINED.where(Object.name == "milk"), PickUpAction.process_metadata_id), id="a join"),
+        pytest.param(
+            selected(JOINED.where(orm.Object.name == "milk"), orm.PickUpAction.process_metadata_id), id="a join"
+        ),
         pytest.param(spatial_relations, id="spatial relations"),
         pytest.param(the_tree, id="the task tree"),
         pytest.param(a_snapshot, id="a snapshot"),

@@ -7,18 +7,7 @@ from functools import partial
 import pytest
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
-    ObjectValue,
-)
+from pycrorm_async.events import types as events
 from pycrorm_async.query.episode_diff import Difference
 from pycrorm_async.query.reading import Reading
 from tests.databases import ask, run_in_own_loop
@@ -35,56 +24,56 @@ def trip(number: int, *, arm: str, x: float, fails: bool) -> Script:
     script = Script(number)
     put = script.put
     libraries = {"numpy": "2.0", "scipy": "1.0"} if fails else {"numpy": "2.1"}
-    put(EpisodeStarted("tidy", "me", "host", "1", "3.11", plan="tidy", libraries=libraries))
+    put(events.EpisodeStarted("tidy", "me", "host", "1", "3.11", plan="tidy", libraries=libraries))
     for _ in range(number):  # so that the sequences of the two episodes differ
-        put(ObjectAdded(f"cup {_}", "CUP", pose(0)))
-    root = put(NodeStarted("root"))
-    milk = put(ObjectAdded("milk", "MILK", pose(1)))
-    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(x + 1e-9)}))
-    put(NodeEnded(drive, "SUCCEEDED"))
-    grasp = {"object_designator": ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
-    pick = put(NodeStarted("action", root, name_of(PICK_UP), grasp))
-    moved = put(ObjectMoved(milk, "milk", "MILK", pose(x), pick))
-    put(ObjectRemoved(ObjectReference(milk, moved)))
+        put(events.ObjectAdded(f"cup {_}", "CUP", pose(0)))
+    root = put(events.NodeStarted("root"))
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1)))
+    drive = put(events.NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(x + 1e-9)}))
+    put(events.NodeEnded(drive, "SUCCEEDED"))
+    grasp = {"object_designator": events.ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
+    pick = put(events.NodeStarted("action", root, name_of(PICK_UP), grasp))
+    moved = put(events.ObjectMoved(milk, "milk", "MILK", pose(x), pick))
+    put(events.ObjectRemoved(events.ObjectReference(milk, moved)))
     if not fails:
-        put(NodeEnded(pick, "SUCCEEDED"))
-        put(NodeEnded(root, "SUCCEEDED"))
-        put(EpisodeEnded("SUCCEEDED"))
+        put(events.NodeEnded(pick, "SUCCEEDED"))
+        put(events.NodeEnded(root, "SUCCEEDED"))
+        put(events.EpisodeEnded("SUCCEEDED"))
         return script
-    put(NodeEnded(pick, "FAILED", FailureValue("a.IKError", "too far")))
+    put(events.NodeEnded(pick, "FAILED", events.FailureValue("a.IKError", "too far")))
     for _ in range(2):
-        said = put(NodeStarted("action", root, name_of(SAYING), {"text": "oh"}))
-        inner = put(NodeStarted("action", said, name_of(SAYING), {"text": "no"}))
-        put(NodeEnded(inner, "SUCCEEDED"))
-        put(NodeEnded(said, "SUCCEEDED"))
-    put(NodeEnded(root, "FAILED", FailureValue("a.IKError", "too far")))
-    put(EpisodeEnded("FAILED", FailureValue("a.IKError", "too far")))
+        said = put(events.NodeStarted("action", root, name_of(SAYING), {"text": "oh"}))
+        inner = put(events.NodeStarted("action", said, name_of(SAYING), {"text": "no"}))
+        put(events.NodeEnded(inner, "SUCCEEDED"))
+        put(events.NodeEnded(said, "SUCCEEDED"))
+    put(events.NodeEnded(root, "FAILED", events.FailureValue("a.IKError", "too far")))
+    put(events.EpisodeEnded("FAILED", events.FailureValue("a.IKError", "too far")))
     return script
 
 
 def cups(number: int, *places: float) -> Script:
     """Return an episode that adds cups of one name, and moves the first one last."""
     script = Script(number)
-    script.put(EpisodeStarted("cups", "me", "host", "1", "3.11"))
-    added = [script.put(ObjectAdded("cup", "CUP", pose(x))) for x in places]
-    script.put(ObjectAdded("cup 2", "CUP", pose(9)))
-    script.put(ObjectMoved(added[0], "cup", "CUP", pose(places[0] + 0.5)))
-    script.put(EpisodeEnded("SUCCEEDED"))
+    script.put(events.EpisodeStarted("cups", "me", "host", "1", "3.11"))
+    added = [script.put(events.ObjectAdded("cup", "CUP", pose(x))) for x in places]
+    script.put(events.ObjectAdded("cup 2", "CUP", pose(9)))
+    script.put(events.ObjectMoved(added[0], "cup", "CUP", pose(places[0] + 0.5)))
+    script.put(events.EpisodeEnded("SUCCEEDED"))
     return script
 
 
 def near(number: int, x: float) -> Script:
     """Return an episode whose numbers differ from those of another `x` by less than three digits show."""
     script = Script(number)
-    script.put(EpisodeStarted("near", "me", "host", "1", "3.11"))
-    cup = script.put(ObjectAdded("cup", "CUP", pose(x)))
-    part = ObjectValue("ObjectPart", "lid", "LID", pose(x), ObjectReference(cup, cup))
-    root = script.put(NodeStarted("root"))
+    script.put(events.EpisodeStarted("near", "me", "host", "1", "3.11"))
+    cup = script.put(events.ObjectAdded("cup", "CUP", pose(x)))
+    part = events.ObjectValue("ObjectPart", "lid", "LID", pose(x), events.ObjectReference(cup, cup))
+    root = script.put(events.NodeStarted("root"))
     for dtype, parameters in ((NAVIGATE, {"target_location": pose(x)}), (PICK_UP, {"object_designator": part})):
-        node = script.put(NodeStarted("action", root, name_of(dtype), parameters))
-        script.put(NodeEnded(node, "SUCCEEDED"))
-    script.put(NodeEnded(root, "SUCCEEDED"))
-    script.put(EpisodeEnded("SUCCEEDED"))
+        node = script.put(events.NodeStarted("action", root, name_of(dtype), parameters))
+        script.put(events.NodeEnded(node, "SUCCEEDED"))
+    script.put(events.NodeEnded(root, "SUCCEEDED"))
+    script.put(events.EpisodeEnded("SUCCEEDED"))
     return script
 
 

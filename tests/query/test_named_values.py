@@ -7,17 +7,7 @@ import json
 import pytest
 import sqlalchemy as sa
 
-from pycrorm_async.events.types import (
-    EndReference,
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeStarted,
-    PoseReference,
-    PoseValue,
-    RobotValue,
-)
+from pycrorm_async.events import types as events
 from pycrorm_async.live.follower import Activity
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.projections.custom import Changes, Event, Projection
@@ -47,23 +37,23 @@ from tests.projections.sql_queries import ask, stored_and_folded
 
 GO = declared("GoAction", "go_action", field("place", "pose", 2), field("arm", "enum", 3))
 PLACE = {"position": [1.0, 2.0, 0.0], "orientation": [0.0, 0.0, 0.0, 1.0], "frame": "map", "time_ns": T0_NS - 1_000_007}
-OTHER = PoseValue((0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 5)
+OTHER = events.PoseValue((0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 5)
 
 
 def _script() -> Script:
     """An action goes to a place by another action, whose motion and its own have other targets."""
-    script, robot = Script(), RobotValue(pose())
-    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
-    root = script.put(NodeStarted("root"))
-    go = script.put(NodeStarted("action", root, name_of(GO), {"place": pose(1, 2), "arm": "LEFT"}, robot))
-    named = PoseReference(go, "place", 2)
-    navigate = script.put(NodeStarted("action", go, name_of(NAVIGATE), {"target_location": named}, robot))
+    script, robot = Script(), events.RobotValue(pose())
+    script.put(events.EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(events.NodeStarted("root"))
+    go = script.put(events.NodeStarted("action", root, name_of(GO), {"place": pose(1, 2), "arm": "LEFT"}, robot))
+    named = events.PoseReference(go, "place", 2)
+    navigate = script.put(events.NodeStarted("action", go, name_of(NAVIGATE), {"target_location": named}, robot))
     for target in (named, OTHER):
-        motion = script.put(NodeStarted("motion", navigate, name_of(MOVE), {"target": target}))
-        script.put(NodeEnded(motion, "SUCCEEDED"))
+        motion = script.put(events.NodeStarted("motion", navigate, name_of(MOVE), {"target": target}))
+        script.put(events.NodeEnded(motion, "SUCCEEDED"))
     for node in (navigate, go, root):
-        script.put(NodeEnded(node, "SUCCEEDED"))
-    script.put(EpisodeEnded("SUCCEEDED"))
+        script.put(events.NodeEnded(node, "SUCCEEDED"))
+    script.put(events.EpisodeEnded("SUCCEEDED"))
     return script
 
 
@@ -91,12 +81,12 @@ async def test_views_and_moments_have_parameters_with_the_pose_and_the_tables_on
 async def test_views_survive_what_only_looks_like_a_name_of_a_pose(log: EventLog) -> None:
     label = declared("LabelAction", "label_action", field("texts", "dict", 2, item="text"))
     script = Script()
-    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
-    root = script.put(NodeStarted("root"))
+    script.put(events.EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(events.NodeStarted("root"))
     given = [{"texts": {"pose_of": text}} for text in ("milk", "1.5", "9" * 30)]
     given += [{"texts": {"pose_of": "2", "field": "x"}, 'a"b': {"missing": "why", "repr": "c"}}]
     for parameters in given:
-        script.put(NodeStarted("action", root, name_of(label), parameters))
+        script.put(events.NodeStarted("action", root, name_of(label), parameters))
     await stored_and_folded(log, [*declarations(label), *script.records])
     for view in ("designator", "action"):
         rows = await ask(log, f"SELECT parameters FROM {view} ORDER BY id")
@@ -117,8 +107,8 @@ async def test_a_damaged_event_hides_its_pose_and_not_the_nodes_that_name_it(log
 def test_cases_and_the_live_page_have_the_pose() -> None:
     types = {name_of(each): each for each in (GO, NAVIGATE, MOVE)}
     cases: list[Case] = []
-    events = _script().stored()
-    refused = EpisodeCases().read(((event, happening_of(event)) for event in events), types.get, cases)
+    stored = _script().stored()
+    refused = EpisodeCases().read(((event, happening_of(event)) for event in stored), types.get, cases)
     assert refused is None
     navigated, went = cases
     features = [navigated.numbers[f"target_location_{each}"] for each in ("x", "y", "z", "yaw")]
@@ -126,7 +116,7 @@ def test_cases_and_the_live_page_have_the_pose() -> None:
     assert features == [1.0, 2.0, 0.0, 0.0]
 
     activity = Activity(EpisodeRow(1, "e", 12, 12, T0_NS, None))
-    for event in events[:5]:
+    for event in stored[:5]:
         activity.read(event, {name: each.dtype for name, each in types.items()})
     place = parameters_text({"target": PLACE}).removeprefix("target=")
     assert activity.now == ["GoAction", f"NavigateAction target_location={place}", f"MoveMotion target={place}"]
@@ -134,22 +124,27 @@ def test_cases_and_the_live_page_have_the_pose() -> None:
 
 # --- failures -----------------------------------------------------------------------------------------------------
 
-FAR, LATE = FailureValue("plan.IKError", "too far", ["LEFT", {"m": 2.5}]), FailureValue("plan.TooLate", "5 s", [])
+FAR, LATE = (
+    events.FailureValue("plan.IKError", "too far", ["LEFT", {"m": 2.5}]),
+    events.FailureValue("plan.TooLate", "5 s", []),
+)
 
 
 def _failing() -> Script:
     """A motion fails, and the two actions around it pass its failure on; then the root fails with another one."""
     script = Script()
-    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
-    root = script.put(NodeStarted("root"))
-    go = script.put(NodeStarted("action", root, name_of(GO), {"place": pose(1, 2), "arm": "LEFT"}))
-    navigate = script.put(NodeStarted("action", go, name_of(NAVIGATE), {"target_location": pose(3)}))
-    motion = script.put(NodeStarted("motion", navigate, name_of(MOVE), {"target": pose(3)}))
-    end = script.put(NodeEnded(motion, "FAILED", FAR))
+    script.put(events.EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(events.NodeStarted("root"))
+    go = script.put(events.NodeStarted("action", root, name_of(GO), {"place": pose(1, 2), "arm": "LEFT"}))
+    navigate = script.put(events.NodeStarted("action", go, name_of(NAVIGATE), {"target_location": pose(3)}))
+    motion = script.put(events.NodeStarted("motion", navigate, name_of(MOVE), {"target": pose(3)}))
+    end = script.put(events.NodeEnded(motion, "FAILED", FAR))
     for node in (navigate, go):
-        script.put(NodeEnded(node, "FAILED", FailureValue(FAR.type, "", of=EndReference(motion, end))))
-    script.put(NodeEnded(root, "FAILED", LATE))
-    script.put(EpisodeEnded("FAILED", LATE))
+        script.put(
+            events.NodeEnded(node, "FAILED", events.FailureValue(FAR.type, "", of=events.EndReference(motion, end)))
+        )
+    script.put(events.NodeEnded(root, "FAILED", LATE))
+    script.put(events.EpisodeEnded("FAILED", LATE))
     return script
 
 
@@ -184,9 +179,9 @@ async def test_views_and_moments_and_pages_have_the_failure_at_each_node(log: Ev
 class Ends(Projection):
     name, version = "ends", 1
     tables = {"ending": {"message": "text", "arguments": "json"}}  # noqa: RUF012 - a common form in user code
-    reads = (NodeEnded,)
+    reads = (events.NodeEnded,)
 
     def fold(self, event: Event, rows: Changes) -> None:
-        failure = event.happening.failure if isinstance(event.happening, NodeEnded) else None
+        failure = event.happening.failure if isinstance(event.happening, events.NodeEnded) else None
         if failure is not None:
             rows.insert("ending", event.id, message=failure.message, arguments=failure.arguments)

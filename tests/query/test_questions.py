@@ -12,17 +12,7 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectMoved,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events import types as events
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.query.reading import Reading
@@ -191,13 +181,13 @@ async def test_durations_are_summed_up_for_each_type(reading: Reading, kind: Any
 
 async def test_a_missing_value_has_the_same_place_in_the_order_on_both_databases(database_url: str) -> None:
     script = Script(1)
-    script.put(EpisodeStarted("orders", "me", "host", "1", "3.11"))
-    root = script.put(NodeStarted("root"))
-    milk = script.put(ObjectAdded("milk", "MILK", pose(1)))
-    script.put(NodeStarted("action", root, name_of(NAVIGATE)))  # runs, so that its type has no duration
-    for parameters in ({"object_designator": ObjectReference(milk, milk)}, {}):
-        node = script.put(NodeStarted("action", root, name_of(PICK_UP), parameters))
-        script.put(NodeEnded(node, "FAILED", FailureValue("a.IKError", "too far")))
+    script.put(events.EpisodeStarted("orders", "me", "host", "1", "3.11"))
+    root = script.put(events.NodeStarted("root"))
+    milk = script.put(events.ObjectAdded("milk", "MILK", pose(1)))
+    script.put(events.NodeStarted("action", root, name_of(NAVIGATE)))  # runs, so that its type has no duration
+    for parameters in ({"object_designator": events.ObjectReference(milk, milk)}, {}):
+        node = script.put(events.NodeStarted("action", root, name_of(PICK_UP), parameters))
+        script.put(events.NodeEnded(node, "FAILED", events.FailureValue("a.IKError", "too far")))
     await append_and_fold(database_url, [*declarations(NAVIGATE, PICK_UP), *script.records])
     async with Reading.open(database_url) as reading:
         assert [each.dtype for each in await reading.ask.durations(limit=1).rows()] == ["PickUpAction"]
@@ -272,7 +262,7 @@ async def test_each_move_of_an_object_has_the_action_that_moved_it(reading: Read
     reckoned = []
     for episode in EPISODES:
         for sequence, happening in enumerate(episode.happenings, 1):
-            if isinstance(happening, ObjectMoved) and happening.name == "milk":
+            if isinstance(happening, events.ObjectMoved) and happening.name == "milk":
                 mover = by_place.get((episode.number, happening.node or 0))
                 around = mover.up() if mover is not None else iter(())
                 action = next((each for each in around if each.started.kind == "action"), None)
@@ -308,12 +298,12 @@ async def test_episodes_are_chosen_by_each_condition(reading: Reading) -> None:
         assert 0 < len(numbers) < len(EPISODES)
         return numbers
 
-    def start_of(number: int) -> EpisodeStarted:
+    def start_of(number: int) -> events.EpisodeStarted:
         happening = started[number]
-        assert isinstance(happening, EpisodeStarted)
+        assert isinstance(happening, events.EpisodeStarted)
         return happening
 
-    assert await chosen(status="running") == reckoned(lambda each: not isinstance(ended[each], EpisodeEnded))
+    assert await chosen(status="running") == reckoned(lambda each: not isinstance(ended[each], events.EpisodeEnded))
     assert await chosen(status=TaskStatus.FAILED) == reckoned(
         lambda each: getattr(ended[each], "status", "") == "FAILED"
     )
@@ -520,12 +510,12 @@ async def test_an_arm_that_is_a_number_or_a_list_is_text_on_both_databases(datab
     numbered = declared("NumberedArm", "numbered_arm", field("arm", "integer", 2))
     listed = declared("ListedArm", "listed_arm", field("arm", "list", 2, item="text"))
     script = Script(1)
-    script.put(EpisodeStarted("", "me", "host", "1", "3.11"))
+    script.put(events.EpisodeStarted("", "me", "host", "1", "3.11"))
     for type_, arm in ((numbered, 3), (listed, ["LEFT", "RIGHT"]), (PICK_UP, "LEFT")):
-        robot = RobotValue(pose(), "ROBOT", None)
-        node = script.put(NodeStarted("action", None, name_of(type_), {"arm": arm}, robot))
-        script.put(NodeEnded(node, "FAILED", FailureValue("ValueError", "")))
-    script.put(EpisodeEnded("FAILED"))
+        robot = events.RobotValue(pose(), "ROBOT", None)
+        node = script.put(events.NodeStarted("action", None, name_of(type_), {"arm": arm}, robot))
+        script.put(events.NodeEnded(node, "FAILED", events.FailureValue("ValueError", "")))
+    script.put(events.EpisodeEnded("FAILED"))
     await append_and_fold(database_url, [*declarations(numbered, listed, PICK_UP), *script.records])
     async with Reading.open(database_url) as reading:
         assert (await reading.ask.root_failures()).arm.tolist() == ["3", '["LEFT","RIGHT"]', "LEFT"]

@@ -26,16 +26,7 @@ from pycrorm_async.errors import (
     QueryRefused,
     UnknownEpisode,
 )
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events import types as events
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
@@ -67,20 +58,20 @@ def moment(sequence: int) -> datetime:
 def episode(number: int) -> Script:
     script = Script(number)
     put = script.put
-    put(EpisodeStarted(f"episode {number}", "me", "host", "1.0", "3.11"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
-    robot = RobotValue(pose(0.5), "ROBOT", 0.25)
-    outer = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}, robot))  # 4
-    other = put(NodeStarted("action", root, name_of(SAYING), {"text": "hi"}))  # 5
-    grasp = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
-    inner = put(NodeStarted("action", outer, name_of(PICK_UP), grasp, robot))  # 6
-    put(NodeEnded(inner, "FAILED", FailureValue("a.IKError", "too far")))  # 7
-    put(NodeEnded(outer, "SUCCEEDED"))  # 8
+    put(events.EpisodeStarted(f"episode {number}", "me", "host", "1.0", "3.11"))  # 1
+    root = put(events.NodeStarted("root"))  # 2
+    milk = put(events.ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
+    robot = events.RobotValue(pose(0.5), "ROBOT", 0.25)
+    outer = put(events.NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}, robot))  # 4
+    other = put(events.NodeStarted("action", root, name_of(SAYING), {"text": "hi"}))  # 5
+    grasp = {"object_designator": events.ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+    inner = put(events.NodeStarted("action", outer, name_of(PICK_UP), grasp, robot))  # 6
+    put(events.NodeEnded(inner, "FAILED", events.FailureValue("a.IKError", "too far")))  # 7
+    put(events.NodeEnded(outer, "SUCCEEDED"))  # 8
     if number == 2:
-        put(NodeEnded(other, "SUCCEEDED"))  # 9
-        put(NodeEnded(root, "SUCCEEDED"))  # 10
-        put(EpisodeEnded("SUCCEEDED"))  # 11
+        put(events.NodeEnded(other, "SUCCEEDED"))  # 9
+        put(events.NodeEnded(root, "SUCCEEDED"))  # 10
+        put(events.EpisodeEnded("SUCCEEDED"))  # 11
     return script
 
 

@@ -9,31 +9,8 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import DBAPIError
 
 from pycrorm_async.errors import UnknownEpisode
+from pycrorm_async.events import types as events
 from pycrorm_async.events.ids import episode_text
-from pycrorm_async.events.types import (
-    CandidateValue,
-    EpisodeEnded,
-    EpisodeStarted,
-    EpisodeTagged,
-    FailureValue,
-    JointsMoved,
-    LocationResolved,
-    NodeEnded,
-    NodeReference,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectDetected,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
-    Observed,
-    RefusalValue,
-    RobotValue,
-    SeenValue,
-    StateSampled,
-)
 from pycrorm_async.orm import Action, Motion, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.projections.columns import COLUMNS
@@ -64,51 +41,56 @@ CAREFUL = declared(
     field("via", "list", 6, item="pose"), bases=("PickUpAction",),
 )  # fmt: skip
 EITHER = declared("Either", "either", field("count", "integer", 2), kind="language")
-REFUSED = (RefusalValue(pose(2), "LEFT: too far"),)
+REFUSED = (events.RefusalValue(pose(2), "LEFT: too far"),)
 TYPES = (NAVIGATE, PICK_UP, CAREFUL, MOVE, EITHER)
 OF_NO_EPISODE = {"designator_type", "concept", "concept_ancestor", "object_concept"}
 REACHED = UserView("reached", select(PickUpAction.arm, PoseRow.x).join(PickUpAction.object).join(PoseRow))
 
 
-def everything(number: int, thinker: NodeReference | None = None) -> Script:
+def everything(number: int, thinker: events.NodeReference | None = None) -> Script:
     """Return an episode with a row in every table; a simulation if a node caused it."""
     script = Script(number)
     put, simulated = script.put, thinker is not None
-    put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated, thought_by=thinker, tags=("t",)))  # 1
-    root = put(NodeStarted("root", simulated=simulated))  # 2
-    milk, table = put(ObjectAdded("milk", "MILK", pose(1, 2, 3))), put(ObjectAdded("table", "ENVIRONMENT", pose()))
-    put(ObjectAttached(ObjectReference(table, table), ObjectReference(milk, milk), "top"))  # 5
-    put(ObjectDetached(ObjectReference(table, table), ObjectReference(milk, milk), "top"))  # 6
-    robot = RobotValue(pose(0.5), "ROBOT", 0.25)
-    either = put(NodeStarted("language", root, name_of(EITHER), {"count": 2}, robot, simulated))  # 7
-    drive = put(NodeStarted("action", either, name_of(NAVIGATE), {"target_location": pose(7)}, robot, simulated))
-    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7)}, robot, simulated))
-    put(StateSampled(ObjectReference(table, table), {"base.x": 0.5}, move))
-    put(JointsMoved(ObjectReference(table, table), {"drawer": 0.25}, move))
-    put(NodeEnded(move, "SUCCEEDED"))
-    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1), ("LEFT",)),), 0, 4, drive, REFUSED))
-    seen = SeenValue("milk", "MILK", pose(1), ObjectReference(milk, milk), 1.0)
-    put(ObjectDetected("camera", "MILK", (seen,), drive))
-    put(NodeEnded(drive, "SUCCEEDED"))
-    moved = put(ObjectMoved(milk, "milk", "MILK", pose(2, 2, 3)))
-    grasp = {"object_designator": ObjectReference(milk, moved), "arm": "LEFT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", either, name_of(PICK_UP), grasp, robot, simulated))
-    put(NodeEnded(pick, "FAILED", FailureValue("a.IKError", "too far")))
+    put(
+        events.EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated, thought_by=thinker, tags=("t",))
+    )  # 1
+    root = put(events.NodeStarted("root", simulated=simulated))  # 2
+    milk, table = (
+        put(events.ObjectAdded("milk", "MILK", pose(1, 2, 3))),
+        put(events.ObjectAdded("table", "ENVIRONMENT", pose())),
+    )
+    put(events.ObjectAttached(events.ObjectReference(table, table), events.ObjectReference(milk, milk), "top"))  # 5
+    put(events.ObjectDetached(events.ObjectReference(table, table), events.ObjectReference(milk, milk), "top"))  # 6
+    robot = events.RobotValue(pose(0.5), "ROBOT", 0.25)
+    either = put(events.NodeStarted("language", root, name_of(EITHER), {"count": 2}, robot, simulated))  # 7
+    drive = put(events.NodeStarted("action", either, name_of(NAVIGATE), {"target_location": pose(7)}, robot, simulated))
+    move = put(events.NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7)}, robot, simulated))
+    put(events.StateSampled(events.ObjectReference(table, table), {"base.x": 0.5}, move))
+    put(events.JointsMoved(events.ObjectReference(table, table), {"drawer": 0.25}, move))
+    put(events.NodeEnded(move, "SUCCEEDED"))
+    put(events.LocationResolved("CostmapLocation", (events.CandidateValue(pose(1), ("LEFT",)),), 0, 4, drive, REFUSED))
+    seen = events.SeenValue("milk", "MILK", pose(1), events.ObjectReference(milk, milk), 1.0)
+    put(events.ObjectDetected("camera", "MILK", (seen,), drive))
+    put(events.NodeEnded(drive, "SUCCEEDED"))
+    moved = put(events.ObjectMoved(milk, "milk", "MILK", pose(2, 2, 3)))
+    grasp = {"object_designator": events.ObjectReference(milk, moved), "arm": "LEFT", "grasp": "TOP"}
+    pick = put(events.NodeStarted("action", either, name_of(PICK_UP), grasp, robot, simulated))
+    put(events.NodeEnded(pick, "FAILED", events.FailureValue("a.IKError", "too far")))
     slowly = grasp | {"speed": 0.5, "via": [pose(3), pose(4)]}
-    careful = put(NodeStarted("action", either, name_of(CAREFUL), slowly, robot, simulated))
-    put(NodeEnded(careful, "SUCCEEDED"))
-    put(ObjectRemoved(ObjectReference(milk, moved)))
-    put(ObjectAdded("pr2", "ROBOT", pose()))
-    put(NodeEnded(either, "SUCCEEDED"))
-    put(Observed("force", {"x": 1.5}, root))
-    put(NodeEnded(root, "SUCCEEDED"))
-    put(EpisodeEnded("SUCCEEDED"))
-    put(EpisodeTagged(("late",)))
+    careful = put(events.NodeStarted("action", either, name_of(CAREFUL), slowly, robot, simulated))
+    put(events.NodeEnded(careful, "SUCCEEDED"))
+    put(events.ObjectRemoved(events.ObjectReference(milk, moved)))
+    put(events.ObjectAdded("pr2", "ROBOT", pose()))
+    put(events.NodeEnded(either, "SUCCEEDED"))
+    put(events.Observed("force", {"x": 1.5}, root))
+    put(events.NodeEnded(root, "SUCCEEDED"))
+    put(events.EpisodeEnded("SUCCEEDED"))
+    put(events.EpisodeTagged(("late",)))
     return script
 
 
 REAL, THINKING = Script(1).episode, 8
-THOUGHT = NodeReference(episode_text(REAL), THINKING)
+THOUGHT = events.NodeReference(episode_text(REAL), THINKING)
 
 
 async def store_and_fold(log: EventLog, *scripts: Script) -> None:
@@ -209,8 +191,8 @@ async def test_later_simulations_are_visible_too(log: EventLog) -> None:
             await store_and_fold(log, everything(2, THOUGHT))
             assert await session.scalar(select(func.count()).select_from(Motion)) == 2
         script = Script(3)
-        script.put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=True))
-        script.put(NodeStarted("action", None, name_of(new), {"times": 3}, simulated=True))
+        script.put(events.EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=True))
+        script.put(events.NodeStarted("action", None, name_of(new), {"times": 3}, simulated=True))
         projector = Projector(log)
         await projector.open()
         await log.append([*declarations(*TYPES, new), *script.records])
@@ -223,8 +205,8 @@ async def test_later_simulations_are_visible_too(log: EventLog) -> None:
 
 
 async def test_the_overview_leaves_simulations_out_unless_asked_and_one_is_found_by_its_name(log: EventLog) -> None:
-    deeper = NodeReference(episode_text(Script(2).episode), 2)
-    elsewhere = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
+    deeper = events.NodeReference(episode_text(Script(2).episode), 2)
+    elsewhere = events.NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
     await store_and_fold(log, everything(1), everything(2, THOUGHT), everything(3, deeper), everything(4, elsewhere))
     async with Reading.open_address(log.address) as reading:
         assert [(each.number, each.simulated, each.thought_by) for each in await reading.episodes()] == [
@@ -244,7 +226,7 @@ async def test_the_overview_leaves_simulations_out_unless_asked_and_one_is_found
 
 
 async def test_a_tree_names_the_simulations_of_its_nodes_and_a_simulations_own_tree_is_printed(log: EventLog) -> None:
-    root = NodeReference(episode_text(REAL), 2)
+    root = events.NodeReference(episode_text(REAL), 2)
     await store_and_fold(log, everything(1), everything(2, THOUGHT), everything(3, THOUGHT), everything(4, root))
     async with Reading.open_address(log.address) as reading:
         tree, simulation_tree = await reading.tree(1), await reading.tree(2)

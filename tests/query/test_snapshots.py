@@ -205,8 +205,8 @@ async def test_a_time_selects_the_last_event_before_it(reading: Reading) -> None
 async def test_the_moments_of_one_pass_are_the_snapshots_after_each_of_these_events(
     reading: Reading, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log, events = await reading.log(), {1, 6, 10, 14, 15}
-    expected = [await reading.as_of(1, sequence=each) for each in sorted(events)]
+    log, sequences = await reading.log(), {1, 6, 10, 14, 15}
+    expected = [await reading.as_of(1, sequence=each) for each in sorted(sequences)]
     read: list[int] = []
     real = EpisodeReplay.read
 
@@ -215,7 +215,7 @@ async def test_the_moments_of_one_pass_are_the_snapshots_after_each_of_these_eve
         return real(replay, event)
 
     monkeypatch.setattr(EpisodeReplay, "read", noted)
-    assert [each async for each in moments(log, 1, events)] == expected
+    assert [each async for each in moments(log, 1, sequences)] == expected
     assert read == [*range(1, 16)]
 
 
@@ -467,13 +467,13 @@ async def test_a_node_has_the_number_of_its_percepts_and_of_the_places_for_it(re
 
 
 def test_a_snapshot_keeps_the_latest_and_counts_all() -> None:
-    events = search_script().stored()
+    stored = search_script().stored()
     replay = EpisodeReplay(EpisodeRow(1, "x", 204, 0, 0), DatabaseAddress.parse("sqlite:///x.db"))
     replay.dtypes = {name_of(NAVIGATE): "NavigateAction"}
-    for event in events[:4]:
+    for event in stored[:4]:
         replay.read(event)
     for sequence in range(5, 205):
-        replay.read(events[5]._replace(sequence=sequence))
+        replay.read(stored[5]._replace(sequence=sequence))
     then = moment_of(replay)
     assert [each.sequence for each in then.percepts] == [each for each in range(155, 205) for _ in range(2)]
     assert then.tree[1].detected == 400

@@ -10,23 +10,8 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from pycrorm_async.events import types as events
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    JointsMoved,
-    NodeEnded,
-    NodeStarted,
-    NodeStatus,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectMoved,
-    ObjectReference,
-    PoseValue,
-    RobotValue,
-)
 from pycrorm_async.projections.columns import Layout
 from pycrorm_async.projections.custom_tables import learner_of
 from pycrorm_async.projections.fold import decode_events
@@ -62,28 +47,28 @@ class CaseScript(Script):
 
     def __init__(self, episode: int = 1, *, simulated: bool = False) -> None:
         super().__init__(episode)
-        self.put(EpisodeStarted("", "me", "host", "", "3.11", simulated=simulated))
+        self.put(events.EpisodeStarted("", "me", "host", "", "3.11", simulated=simulated))
         self.robot = self.add("pr2", "ROBOT", pose(1.0, 1.0))
         self.kitchen = self.add("kitchen", "ENVIRONMENT", pose())
 
-    def add(self, name: str, type_: str, at: PoseValue) -> int:
-        return self.put(ObjectAdded(name, type_, at))
+    def add(self, name: str, type_: str, at: events.PoseValue) -> int:
+        return self.put(events.ObjectAdded(name, type_, at))
 
-    def acting(self, at: PoseValue, torso: float | None = 0.25) -> RobotValue:
-        return RobotValue(at, "ROBOT", torso, ObjectReference(self.robot, self.robot), "pr2")
+    def acting(self, at: events.PoseValue, torso: float | None = 0.25) -> events.RobotValue:
+        return events.RobotValue(at, "ROBOT", torso, events.ObjectReference(self.robot, self.robot), "pr2")
 
     def fetch(self, item: int | Mapping[str, Any], parent: int | None = None, **parameters: Any) -> int:
         value = {"object": item, "row": item} if isinstance(item, int) else item
         values = {"item": value, "arm": "LEFT", **parameters}
         robot = self.acting(pose(2.0, 0.0, 0.0, turned=LEFT_TURN))
-        return self.put(NodeStarted("action", parent, name_of(FETCH), values, robot))
+        return self.put(events.NodeStarted("action", parent, name_of(FETCH), values, robot))
 
     def wait(self, parent: int | None = None, seconds: object = 1.5) -> int:
-        return self.put(NodeStarted("action", parent, name_of(WAIT), {"seconds": seconds}))
+        return self.put(events.NodeStarted("action", parent, name_of(WAIT), {"seconds": seconds}))
 
-    def end(self, node: int, status: NodeStatus = "SUCCEEDED", reason: str | None = None) -> int:
-        failure = FailureValue(f"pycrorm_async.plan.failures.{reason}", "no") if reason is not None else None
-        return self.put(NodeEnded(node, status, failure))
+    def end(self, node: int, status: events.NodeStatus = "SUCCEEDED", reason: str | None = None) -> int:
+        failure = events.FailureValue(f"pycrorm_async.plan.failures.{reason}", "no") if reason is not None else None
+        return self.put(events.NodeEnded(node, status, failure))
 
 
 def cases_of(*scripts: Script, first_number: int = 1) -> list[Case]:
@@ -92,8 +77,8 @@ def cases_of(*scripts: Script, first_number: int = 1) -> list[Case]:
     rows = batch()
     assert isinstance(rows, CaseBatch)
     for number, script in enumerate(scripts, first_number):
-        events = script.stored(number)
-        assert rows.fold(events, decode_events(events)[0]) is None
+        stored = script.stored(number)
+        assert rows.fold(stored, decode_events(stored)[0]) is None
     return in_order(CaseBlock.of(rows.cases).cases()) if rows.cases else []
 
 
@@ -101,7 +86,7 @@ def in_order(cases: Iterable[Case]) -> list[Case]:
     return sorted(cases, key=lambda each: each.node)
 
 
-STATUSES: Sequence[tuple[NodeStatus, str | None]] = [
+STATUSES: Sequence[tuple[events.NodeStatus, str | None]] = [
     ("SUCCEEDED", None),
     ("FAILED", "IKError"),
     ("CANCELLED", None),
@@ -113,7 +98,7 @@ def random_script(episode: int, random: Random, *, actions: int) -> CaseScript:
     """Return an episode with actions inside each other in a changing world. It may end, be lost or stay open."""
     script = CaseScript(episode, simulated=random.random() < 0.1)
     objects = [script.add(f"thing {index}", random.choice(["MILK", "BOWL"]), pose(index / 3)) for index in range(3)]
-    open_nodes = [script.put(NodeStarted("root"))]
+    open_nodes = [script.put(events.NodeStarted("root"))]
     for _ in range(actions):
         match random.randrange(8):
             case 0 | 1:
@@ -124,21 +109,26 @@ def random_script(episode: int, random: Random, *, actions: int) -> CaseScript:
                 open_nodes.append(script.wait(open_nodes[-1], random.random() * 4))
             case 3:
                 moved = random.choice(objects)
-                script.put(ObjectMoved(moved, "thing", "MILK", pose(random.random() * 2)))
+                script.put(events.ObjectMoved(moved, "thing", "MILK", pose(random.random() * 2)))
             case 4:
-                change = random.choice([ObjectAttached, ObjectDetached])
-                ends = ObjectReference(script.robot, script.robot), ObjectReference(objects[0], objects[0])
+                change = random.choice([events.ObjectAttached, events.ObjectDetached])
+                ends = (
+                    events.ObjectReference(script.robot, script.robot),
+                    events.ObjectReference(objects[0], objects[0]),
+                )
                 script.put(change(*ends))
             case 5:
-                script.put(JointsMoved(ObjectReference(script.robot, script.robot), {"torso": random.random()}))
+                script.put(
+                    events.JointsMoved(events.ObjectReference(script.robot, script.robot), {"torso": random.random()})
+                )
             case _ if len(open_nodes) > 1:
                 script.end(open_nodes.pop(), *random.choice(STATUSES))
             case _:
-                script.put(NodeStarted("motion", open_nodes[-1]))
+                script.put(events.NodeStarted("motion", open_nodes[-1]))
     if random.random() < 0.6:
         while random.random() < 0.7 and len(open_nodes) > 1:
             script.end(open_nodes.pop())
-        script.put(EpisodeEnded(random.choice(["LOST", "SUCCEEDED"])))
+        script.put(events.EpisodeEnded(random.choice(["LOST", "SUCCEEDED"])))
     return script
 
 

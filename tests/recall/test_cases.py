@@ -17,16 +17,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async import Reading
 from pycrorm_async.errors import DamageError, TablesOutdated
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    NodeStarted,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
-    PoseValue,
-)
+from pycrorm_async.events import types as events
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory, rebuild_projection
@@ -408,14 +399,14 @@ def test_a_case_has_the_situation_before_the_action_and_its_outcome() -> None:
     script.add("bowl", "BOWL", pose(1.0, 0.9, 0.9))
     script.add("cup", "JEROEN_CUP", pose(1.0, 0.5, 0.3))
     table = script.add("table", "GENERIC_OBJECT", pose(5.0))
-    root = script.put(NodeStarted("root"))
+    root = script.put(events.NodeStarted("root"))
     before = script.wait(root)
     script.end(before, "FAILED", "PerceptionTimeout")
     node = script.fetch(
         milk, root, status="urgent", grams=200, gently=True, at="2026-11-23T10:00:00.000000Z",
         goal=pose(2.0, 1.0, 0.5), surface={"object": table, "row": table},
     )  # fmt: skip
-    script.put(ObjectMoved(milk, "milk", "MILK", pose(9.0)))
+    script.put(events.ObjectMoved(milk, "milk", "MILK", pose(9.0)))
     script.end(node, "FAILED", "IKError")
     waited, fetched = cases_of(script)
     assert waited == Case(
@@ -456,7 +447,9 @@ def test_beside_an_object_that_lies_or_leans_the_robot_has_no_place_in_its_frame
     script = CaseScript()
     for degrees in (0, 7, 9, 90, 180):
         turn = radians(degrees) / 2
-        milk = script.add("milk", "MILK", PoseValue((1.0, 0.0, 0.9), (sin(turn), 0.0, 0.0, cos(turn)), "map", T0_NS))
+        milk = script.add(
+            "milk", "MILK", events.PoseValue((1.0, 0.0, 0.9), (sin(turn), 0.0, 0.0, cos(turn)), "map", T0_NS)
+        )
         script.end(script.fetch(milk))
     places = [{"stand_x", "stand_y", "stand_yaw"} & each.numbers.keys() for each in cases_of(script)]
     assert [len(each) for each in places] == [3, 3, 0, 0, 0]
@@ -479,12 +472,12 @@ def test_the_outcome_is_no_feature_of_the_situation_and_a_simulation_is_marked()
 def test_an_action_has_the_action_around_it_and_the_one_before_it_inside_that() -> None:
     script = CaseScript()
     outer = script.wait()
-    sequential = script.put(NodeStarted("language", outer))
+    sequential = script.put(events.NodeStarted("language", outer))
     one = script.wait(sequential)
     inner = script.wait(one)
     script.end(inner)
     script.end(one, "CANCELLED")
-    two = script.wait(script.put(NodeStarted("motion", outer)))
+    two = script.wait(script.put(events.NodeStarted("motion", outer)))
     script.end(two)
     script.end(outer)
     last = script.wait()
@@ -502,16 +495,16 @@ def test_an_action_has_the_action_around_it_and_the_one_before_it_inside_that() 
 def test_what_the_robot_holds_and_what_is_near_follows_the_world() -> None:
     script = CaseScript()
     milk, bowl = script.add("milk", "MILK", pose()), script.add("bowl", "BOWL", pose(0.501))  # not near
-    robot, held = ObjectReference(script.robot, script.robot), ObjectReference(bowl, bowl)
+    robot, held = events.ObjectReference(script.robot, script.robot), events.ObjectReference(bowl, bowl)
     nodes = [script.fetch(milk)]
-    script.put(ObjectAttached(robot, held, "gripper"))
-    script.put(ObjectMoved(bowl, "bowl", "BOWL", pose(0.5)))
+    script.put(events.ObjectAttached(robot, held, "gripper"))
+    script.put(events.ObjectMoved(bowl, "bowl", "BOWL", pose(0.5)))
     nodes.append(script.fetch(milk))
-    script.put(ObjectDetached(robot, held))
+    script.put(events.ObjectDetached(robot, held))
     nodes.append(script.fetch(milk))
-    script.put(ObjectRemoved(held))
+    script.put(events.ObjectRemoved(held))
     nodes.append(script.fetch(milk))
-    script.put(ObjectRemoved(ObjectReference(milk, milk)))
+    script.put(events.ObjectRemoved(events.ObjectReference(milk, milk)))
     nodes.append(script.fetch(milk))
     for node in nodes:
         script.end(node)
@@ -542,14 +535,14 @@ def test_running_actions_become_lost_cases_when_their_episode_is_lost_and_none_o
         outer = script.wait()
         script.end(script.wait(outer), "LOST")
         script.wait(outer)
-        script.put(EpisodeEnded(status))  # type: ignore[arg-type]
+        script.put(events.EpisodeEnded(status))  # type: ignore[arg-type]
     assert [(each.status, each.duration_s) for each in cases_of(lost)] == [("LOST", None)] * 3
     assert [(each.status, each.duration_s) for each in cases_of(ended)] == [("LOST", None)]
 
 
 def test_an_action_whose_type_was_never_declared_is_no_case_and_stops_nothing() -> None:
     script = CaseScript()
-    strange = script.put(NodeStarted("action", designator=name_of(declared("Strange", "strange"))))
+    strange = script.put(events.NodeStarted("action", designator=name_of(declared("Strange", "strange"))))
     inside = script.wait(strange)
     script.end(inside)
     script.end(strange)
