@@ -65,6 +65,7 @@ def selects(statements: list[str], table: str) -> int:
     return sum(f"FROM {table}" in each for each in statements)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_attribute_is_loaded_for_all_objects_of_a_query_at_once(
     statements: list[str], reading: Reading
 ) -> None:
@@ -78,6 +79,7 @@ async def test_an_attribute_is_loaded_for_all_objects_of_a_query_at_once(
     assert [selects(statements, table) for table in ("robot_state", "position")] == [3, 4]  # for any number of rows
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_batch_is_bounded(statements: list[str], reading: Reading, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(orm.base, "BATCH", 2)
     rows = await actions_of(reading)
@@ -115,6 +117,7 @@ async def test_a_closed_session_is_freed_with_its_last_object(reading: Reading) 
     assert kept() is None
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_attribute_is_read_between_the_rows_of_an_open_session(reading: Reading) -> None:
     async with reading.session() as session:
         places = [

@@ -9,13 +9,11 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
-import pycrorm_async.orm
 from pycrorm_async import orm
 from pycrorm_async.events import types as events
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.orm.base import UtcTime
 from pycrorm_async.projections.generations import current_generation
-from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
@@ -41,25 +39,6 @@ pytestmark = pytest.mark.slow
 # === queries ==================================================================================================
 #
 # The queries of the thesis, and the attributes of a row that are loaded without another query.
-
-named = [getattr(pycrorm_async.orm, each) for each in dir(pycrorm_async.orm)]
-CLASSES = sorted(
-    (each for each in named if isinstance(each, type) and issubclass(each, orm.Base)),
-    key=lambda each: each.__name__,
-)
-
-
-async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
-    await Projector(log).open()
-    always_filled = (
-        orm.Base,
-        orm.Concept,
-        orm.ConceptAncestor,
-        orm.ObjectConcept,
-    )  # the concepts belong to the program
-    mapped = [each for each in CLASSES if each not in always_filled]
-    assert len(mapped) > 50
-    assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
 async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import ForeignKey, select
-from sqlalchemy.orm import Mapped, load_only, mapped_column, undefer
+from sqlalchemy.orm import Mapped, load_only, mapped_column
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
@@ -327,17 +327,3 @@ async def test_a_memory_that_only_records_generates_no_class(tmp_path: Path) -> 
         assert set(identities) == before
         mapped = memory.mapped(NoteActionPerformable)
         assert set(identities) - before == {mapped.__mapper__.polymorphic_identity}
-
-
-async def test_a_plain_engine_sees_an_unknown_type_as_an_action_with_its_parameters(tmp_path: Path) -> None:
-    from sqlalchemy.ext.asyncio import AsyncSession, create_async_engine
-
-    async with Memory.open(url_of(tmp_path)):
-        await NoteActionPerformable("seen").perform()
-    engine = create_async_engine(f"sqlite+aiosqlite:///{tmp_path}/memory.db")
-    async with AsyncSession(engine) as session:
-        note = (await session.scalars(select(Action).options(undefer(Action.parameters)))).one()
-        assert type(note) is Action
-        assert (note.dtype, note.parameters) == ("NoteAction", {"text": "seen"})
-        assert (await session.scalars(select(Designator))).one() is note
-    await engine.dispose()

@@ -78,6 +78,7 @@ async def test_views_and_moments_have_parameters_with_the_pose_and_the_tables_on
     assert [node.parameters for node in then.tree] == [{}, *with_pose]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_views_survive_what_only_looks_like_a_name_of_a_pose(log: EventLog) -> None:
     label = declared("LabelAction", "label_action", field("texts", "dict", 2, item="text"))
     script = Script()

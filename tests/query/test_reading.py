@@ -46,6 +46,9 @@ from tests.projections.event_script import (
     row,
 )
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""Both databases run the same selects: those of tests/orm, of moments and of schemas run on both at each commit."""
+
 # === reading ==================================================================================================
 #
 # A memory opened for reading: sessions, named queries, data frames.
@@ -137,20 +140,6 @@ async def test_a_task_tree_lists_parents_first_with_depths_and_durations(reading
     assert await reading.tree(9) == []
 
 
-@pytest.mark.slow
-async def test_a_session_has_classes_for_every_type_in_the_memory(reading: Reading) -> None:
-    async with reading.session() as session:
-        actions = (
-            await session.scalars(select(Action).where(Action.process_metadata_id == 1).order_by(Action.id))
-        ).all()
-    assert [type(each).__name__ for each in actions] == ["NavigateAction", "SayingAction", "PickUpAction"]
-    saying: Any = reading.mapped("SayingAction")
-    async with reading.session() as session:
-        assert [each.text for each in await session.scalars(select(saying))] == ["hi", "hi"]
-    with pytest.raises(CallerError):
-        reading.mapped("WavingAction")
-
-
 async def test_a_session_cannot_write(reading: Reading) -> None:
     async with reading.session() as session:
         connection = await session.connection()
@@ -185,18 +174,6 @@ async def test_a_frame_of_the_view_has_its_columns_and_names_of_enum_members(rea
         "object_x": -0.5, "object_y": -2.0, "robot_in_object_x": -0.5, "robot_in_object_y": -2.0, "sequence": 6,
     }  # fmt: skip
     assert len(frame) == 2
-
-
-async def test_a_frame_accepts_conditions_with_enum_members_and_joins(reading: Reading) -> None:
-    question = (
-        select(PickUpAction.arm, Object.name, Pose.x, TaskTreeNode.status)
-        .join(PickUpAction.object)
-        .join(Object.pose)
-        .join(PickUpAction.node)
-        .where(PickUpAction.arm == Arms.LEFT, PickUpAction.process_metadata_id.in_([1, 7]))
-    )
-    frame = await reading.dataframe(question)
-    assert frame.to_dict("records") == [{"arm": "LEFT", "name": "milk", "x": 1.0, "status": "FAILED"}]
 
 
 async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Reading) -> None:

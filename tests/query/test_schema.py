@@ -54,6 +54,7 @@ async def test_a_memory_describes_all_of_its_views(reading: Reading) -> None:
     assert "\n  time bigint  µs since 1970-01-01 00:00 UTC" in text
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_view_that_does_not_exist_is_answered_with_the_nearest(reading: Reading) -> None:
     with pytest.raises(CallerError, match=r"^this memory has no view 'actions'; did you mean action"):
         await read_schema(reading, ["pose", "actions"])
@@ -88,6 +89,7 @@ def commented(url: str) -> dict[tuple[str, str], str]:
     return {(view, column): text for view, column, text in rows}
 
 
+@pytest.mark.slow
 def test_postgresql_keeps_the_texts_as_comments_also_after_new_types_and_a_rebuild(server: Server) -> None:
     url = server.new_database()
     run_in_own_loop(append_and_fold(url, [*declarations(NAVIGATE, PICK_UP), *episode(1).records[:3]]))

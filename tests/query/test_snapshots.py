@@ -21,7 +21,6 @@ from pycrorm_async.events.types import (
     JointsMoved,
     LocationResolved,
     NodeEnded,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
@@ -226,6 +225,10 @@ async def test_the_snapshot_at_the_end_has_the_tree_of_the_tables(reading: Readi
 
     then = await reading.as_of(1, time=1e9)
     assert [summary(each) for each in then.tree] == [summary(each) for each in await reading.tree(1)]
+    for name in ("1", ID, "last", await reading.episode("1")):
+        assert await reading.as_of(name, time=1e9) == then
+    with pytest.raises(UnknownEpisode, match="there is no episode '9'"):
+        await reading.as_of(9, time=1e9)
 
 
 @pytest.mark.slow
@@ -298,27 +301,6 @@ async def test_a_node_without_an_end_has_no_end_time_and_a_removed_object_holds_
 
 
 # --- naming an episode ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.soak_on("postgresql")
-async def test_an_episode_can_be_named_by_number_id_or_last(log: EventLog) -> None:
-    simulation = Script(3)
-    simulation.put(EpisodeStarted("a thought", "me", "h", "1", "3.11", simulated=True, thought_by=NodeReference(ID, 5)))
-    simulation.put(NodeStarted("root", simulated=True))
-    await stored_and_folded(log, [*declarations(*TYPES), *story().records, *story(2).records, *simulation.records])
-    async with Reading.open_address(log.address) as reading:
-        second = await reading.episode("2")
-        for name, number in ((1, 1), ("1", 1), (ID, 1), ("last", 2), (second, 2), (second.id, 2), (3, 3)):
-            then = await reading.as_of(name, sequence=2)
-            assert (then.number, then.simulated) == (number, number == 3)
-        for unknown, message in (
-            (9, "there is no episode '9'"),
-            ("00000000-0000", "3 episodes have an id that begins with '00000000-0000'"),
-            (True, "there is no episode 'True'"),
-        ):
-            with pytest.raises(UnknownEpisode, match=message):
-                await reading.as_of(unknown, sequence=2)
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import TablesOutdated
 from pycrorm_async.events.ids import row_id
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_projection
@@ -19,11 +18,9 @@ from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.recall.answer import Answer, Relation, Sequences, answer, relation, success_of
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary
-from pycrorm_async.recall.cases import CaseProjection
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.recall.search import Cue, Wanted
-from tests.commands import pycrorm
 from tests.databases import Server
 from tests.recall.sliding_grips import FETCH, GRIP, record
 
@@ -313,16 +310,6 @@ async def test_a_type_that_is_renamed_while_the_memory_is_open_is_found_at_once(
         assert len(await recall("GrabAction")) == 3
 
 
-@pytest.mark.soak
-@pytest.mark.slow
-def test_the_command_names_what_it_joined_and_does_not_call_an_old_name_unknown(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path / 'pycrorm.db'}"
-    record_renamed(url, tmp_path, renamed=True)
-    done = pycrorm("recall", "TakeAction", "arm=LEFT", cwd=tmp_path)
-    assert "renamed: counts the cases of GrabAction and TakeAction" in done.stdout
-    assert done.stderr == ""
-
-
 # === same answers =============================================================================================
 #
 # The answers of a memory are the same on both databases and after a rebuild; damage and other versions are named.
@@ -364,13 +351,3 @@ async def test_both_databases_and_a_rebuild_return_the_same_answers(tmp_path: Pa
     for url in (here, there):
         await rebuild_projection(url, own_projections()[0])
         assert await answers(url) == expected
-
-
-@pytest.mark.slow
-async def test_cases_of_another_version_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    url = f"sqlite:///{tmp_path / 'memory.db'}"
-    async with Memory.open(url) as memory:
-        await record(memory)
-    monkeypatch.setattr(CaseProjection, "version", 99)
-    with pytest.raises(TablesOutdated, match=r"its cases have version \d+ instead of 99: run `pycrorm rebuild recall`"):
-        await answers(url)

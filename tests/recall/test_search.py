@@ -12,10 +12,11 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_id
+from pycrorm_async.recall import blocks
 from pycrorm_async.recall import search as activations
 from pycrorm_async.recall import search as searching
 from pycrorm_async.recall.answer import answer
-from pycrorm_async.recall.blocks import WORDS_MAX, CaseBlock, CaseLibrary, Group, decode, encode
+from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, Group, decode, encode
 from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import cue_like
 from pycrorm_async.recall.search import (
@@ -192,7 +193,7 @@ def test_a_library_without_cases_has_no_answer() -> None:
 def test_a_word_that_no_case_has_cannot_hide_a_case_that_matches_all_else() -> None:
     cases = [
         Case(row_id(1, n, 0), n, "A", {"arm": "LEFT", "object_type": "MILK" if n % 2 else "BOWL"}, {}, "FAILED")
-        for n in range(1, 10_001)
+        for n in range(1, 101)
     ]
     library = CaseLibrary([CaseBlock.of(cases)])
     cue = Cue(type="A", has=(("arm", "LEFT"), ("object_type", "CACTUS")))
@@ -210,15 +211,16 @@ def test_a_common_cue_ends_in_the_newest_rows(monkeypatch: pytest.MonkeyPatch) -
         return compare(group, rows, cue, weights, lowest, bound)
 
     monkeypatch.setattr(searching, "_matches", counted)
-    cases = [Case(row_id(1, n, 0), n, "A", {"arm": "LEFT"}, {}, "FAILED") for n in range(1, 10_001)]
-    library = CaseLibrary([CaseBlock.of(cases[:5_000]), CaseBlock.of(cases[5_000:])])
+    monkeypatch.setattr(searching, "_FIRST_ROWS", 40)
+    cases = [Case(row_id(1, n, 0), n, "A", {"arm": "LEFT"}, {}, "FAILED") for n in range(1, 101)]
+    library = CaseLibrary([CaseBlock.of(cases[:50]), CaseBlock.of(cases[50:])])
     assert len(found(Cue(type="A", has=(("arm", "LEFT"),), k=10), library)) == 10
-    assert compared == [slice(0, 4_096)]
+    assert compared == [slice(0, 40)]
 
 
 def test_the_tolerance_of_a_number_does_not_depend_on_the_blocks() -> None:
     chance = random.Random(5)
-    libraries = [library_of(CASES, chance) for _ in range(20)]
+    libraries = [library_of(CASES, chance) for _ in range(5)]
     for feature in ("height", "ticket"):
         assert len({library.tolerance("PickUpAction", feature) for library in libraries}) == 1
     assert libraries[0].tolerance("PickUpAction", "height") == pytest.approx(0.29, abs=0.03)
@@ -363,10 +365,10 @@ def test_a_type_or_a_word_that_never_occurred_is_no_error() -> None:
     check_cue(Cue(type=TYPE, has=(("amr", "LEFT"),)), CaseLibrary())
 
 
-def test_a_feature_with_too_many_words_is_refused_by_its_name() -> None:
-    cases = [Case(row_id(1, n, 0), n, "A", {"id": f"{n}"}, {}, "FAILED") for n in range(1, WORDS_MAX + 2)]
-    half = len(cases) // 2
-    library = CaseLibrary([CaseBlock.of(cases[:half]), CaseBlock.of(cases[half:])])
+def test_a_feature_with_too_many_words_is_refused_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blocks, "WORDS_MAX", 16)
+    cases = [Case(row_id(1, n, 0), n, "A", {"id": f"{n}"}, {}, "FAILED") for n in range(18)]
+    library = CaseLibrary([CaseBlock.of(cases[:9]), CaseBlock.of(cases[9:])])
     assert library.left_out == {"id"}
     with pytest.raises(CallerError, match="id has more than 16,384 different values"):
         check_cue(Cue(type="A", has=(("id", "5"),)), library)

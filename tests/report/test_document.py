@@ -117,13 +117,6 @@ async def test_a_robot_without_a_description_is_a_body_of_human_scale_and_others
     assert lamp["assumed"] == "a point, because its description was not recorded"
 
 
-async def test_a_message_of_a_mebibyte_is_cut_and_its_length_is_in_the_page(url: str) -> None:
-    document = await document_of(url)
-    message = names_of(document, 8)[2]
-    assert len(message) < 21_000
-    assert message.endswith("more characters)")
-
-
 async def test_hostile_text_ends_no_script_and_survives_the_way_into_the_page(url: str) -> None:
     document = await document_of(url)
     page = page_of(document)

@@ -142,15 +142,6 @@ def test_every_tab_draws(opened: Tab, pages: dict[str, Path]) -> None:
     assert_quiet(opened, pages["plan"])
 
 
-def test_the_scene_is_drawn_with_forward_kinematics(chrome: Browser, pages: dict[str, Path]) -> None:
-    gripper = "pycrormPage.bodies.of(pycrormPage.episode.objects[1]).links.get('l_gripper_tool_frame')"
-    where = f"(new THREE.Vector3()).setFromMatrixPosition({gripper}.matrixWorld).toArray()"
-    with chrome.open(pages["plan"]) as tab:
-        tab.ask("pycrormPage.seek(pycrormPage.episode.attachments[0][3])")
-        held, milk = tab.ask(where), tab.ask(POSE.format("milk"))
-        assert max(abs(one - other) for one, other in zip(held, milk, strict=True)) < 0.05
-
-
 def test_a_map_takes_the_place_of_the_scene_without_webgl(chrome: Browser, pages: dict[str, Path]) -> None:
     with chrome.open(pages["plan"], script=NO_WEBGL) as tab:
         assert tab.ask("document.body.className") == "no-webgl"
@@ -194,12 +185,6 @@ def test_the_page_of_a_lost_episode_shows_the_world_at_its_last_event(chrome: Br
         assert tab.ask("pycrormPage.episode.presentAt(pycrormPage.event).length") == 4
         assert tab.ask("pycrormPage.episode.nodes[0].status") == "LOST"
         assert_quiet(tab, pages["dies"])
-
-
-def test_a_robot_that_is_not_the_pr2_is_drawn(opened_drive: Tab, pages: dict[str, Path]) -> None:
-    assert position(opened_drive, "courier") == [1.0, 0.5, 0.0]
-    assert opened_drive.ask("pycrormPage.bodies.of(pycrormPage.episode.objects[0]).links.size") > 5
-    assert_quiet(opened_drive, pages["drives"])
 
 
 def test_recorded_text_is_never_markup(opened: Tab, pages: dict[str, Path]) -> None:

@@ -305,7 +305,6 @@ def in_page(page: Path) -> Any:
     ("options", "numbers", "title"),
     [
         ((), [1, 2, 3], "Episodes"),
-        (("--text", "milk"), [2, 3], "Episodes: text milk"),
         (("--tag", "night", "--status", "succeeded"), [3], "Episodes: status succeeded; tag night"),
         (
             ("--since", "2026-01-02 03:04", "--limit", "2"),
