@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Any, ClassVar
 
 from sqlalchemy import ForeignKey
-from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
+from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 
 from pycrorm_async.orm.base import COMPUTED, ON_REQUEST, Base, JsonText, RowOfEvent, one_of
 from pycrorm_async.world.pose import ObjectType
@@ -139,13 +139,23 @@ class Quaternion(Base):
     w: Mapped[float]
 
 
-class Pose(RowOfEvent, Base):
+class RowOfEpisode(RowOfEvent, MappedAsDataclass, init=False, repr=False, eq=False):
+    """A row of an episode, with an id of its own: the first two columns of its table."""
+
+    id: Mapped[int] = mapped_column(primary_key=True, sort_order=-2)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True, sort_order=-1)
+
+    @declared_attr
+    def process_metadata(cls) -> Mapped[ProcessMetaData]:
+        related: Mapped[ProcessMetaData] = relationship(viewonly=True)
+        return related
+
+
+class Pose(RowOfEpisode, Base):
     """A position (m) and an orientation (unit quaternion), also as columns, so that queries need no join for them."""
 
     __tablename__ = "pose"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), index=True)
     time: Mapped[datetime] = mapped_column(info={"after": "qw"})
     frame: Mapped[str] = mapped_column(info={"after": "qw"})
     position_id: Mapped[int] = mapped_column(ForeignKey("position.id"), info=COMPUTED)
@@ -160,7 +170,6 @@ class Pose(RowOfEvent, Base):
 
     position: Mapped[Position] = one_of(lambda: Pose.position_id, "position")
     orientation: Mapped[Quaternion] = one_of(lambda: Pose.orientation_id, "quaternion")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class RobotState(RowOfEvent, Base):

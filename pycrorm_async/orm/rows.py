@@ -34,7 +34,7 @@ from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.types import BoxValue, DescriptionDeclared, MeshValue
 from pycrorm_async.orm import base as orm_base
-from pycrorm_async.orm.episodes import Pose, ProcessMetaData, RobotState
+from pycrorm_async.orm.episodes import Pose, ProcessMetaData, RobotState, RowOfEpisode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
@@ -133,7 +133,7 @@ class ObjectDescription(orm_base.Base):
         return self.declared.missing
 
 
-class Object(orm_base.RowOfEvent, orm_base.Base):
+class Object(RowOfEpisode, orm_base.Base):
     """An object of the world at a moment.
 
     Attributes:
@@ -155,8 +155,6 @@ class Object(orm_base.RowOfEvent, orm_base.Base):
 
     __tablename__ = "object"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     dtype: Mapped[str]
     name: Mapped[str]
     obj_type: Mapped[ObjectType | None] = mapped_column(index=True)
@@ -186,7 +184,6 @@ class Object(orm_base.RowOfEvent, orm_base.Base):
     node: Mapped[TaskTreeNode | None] = orm_base.one_of(
         lambda: Object.node_id, "task_tree_node", info=orm_base.ON_REQUEST
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
 
@@ -230,29 +227,24 @@ class BelieveObject(Object):
     __mapper_args__ = {"polymorphic_identity": "BelieveObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
 
-class ObjectRemoval(orm_base.RowOfEvent, orm_base.Base):
+class ObjectRemoval(RowOfEpisode, orm_base.Base):
     """The removal of an object from the world."""
 
     __tablename__ = "object_removal"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     object_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"))
     identity_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"), index=True)
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"))
 
     object: Mapped[Object] = orm_base.one_of(lambda: ObjectRemoval.object_id, "object")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
-class Attachment(orm_base.RowOfEvent, orm_base.Base):
+class Attachment(RowOfEpisode, orm_base.Base):
     """A change at `time`: `child` begins to move with `link` of `parent` (`kind` attached), or stops (detached)."""
 
     __tablename__ = "attachment"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     kind: Mapped[str]
     parent_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"))
     child_id: Mapped[int] = mapped_column(sa.ForeignKey("object.id"), index=True)
@@ -262,7 +254,6 @@ class Attachment(orm_base.RowOfEvent, orm_base.Base):
 
     parent: Mapped[Object] = orm_base.one_of(lambda: Attachment.parent_id, "object")
     child: Mapped[Object] = orm_base.one_of(lambda: Attachment.child_id, "object")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class JointChange(orm_base.RowOfEvent, orm_base.Base):
@@ -581,7 +572,7 @@ class ObjectPartParameter(ObjectParameter):
 # Map the task tree: a node for every perform, and the candidates of its location designators.
 
 
-class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
+class TaskTreeNode(RowOfEpisode, orm_base.Base):
     """One perform, from its start to its end.
 
     Attributes:
@@ -612,8 +603,6 @@ class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
         "failure_node_id": {"storage": "row", "after": "failure_arguments"},
     }
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     parent_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     action_id: Mapped[int | None] = mapped_column(sa.ForeignKey("designator.id"), info=orm_base.COMPUTED)
     kind: Mapped[str]
@@ -642,7 +631,6 @@ class TaskTreeNode(orm_base.RowOfEvent, orm_base.Base):
     children: Mapped[list[TaskTreeNode]] = orm_base.many_of(
         lambda: TaskTreeNode.parent_id, "task_tree_node", order_by=lambda: TaskTreeNode.id, info=orm_base.ON_REQUEST
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     @property
     def ancestors(self) -> list[TaskTreeNode]:
@@ -710,7 +698,7 @@ class LocationRefusal(orm_base.RowOfEvent, orm_base.Base):
     reason: Mapped[str]
 
 
-class LocationResolution(orm_base.RowOfEvent, orm_base.Base):
+class LocationResolution(RowOfEpisode, orm_base.Base):
     """A location designator's answer to one request for a place.
 
     Attributes:
@@ -731,8 +719,6 @@ class LocationResolution(orm_base.RowOfEvent, orm_base.Base):
 
     __tablename__ = "location_resolution"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     location: Mapped[str]
     considered: Mapped[int]
@@ -756,7 +742,6 @@ class LocationResolution(orm_base.RowOfEvent, orm_base.Base):
         order_by=LocationRefusal.position,
         info=orm_base.ON_REQUEST,
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 # === perception ===============================================================================================
@@ -831,7 +816,7 @@ class StateSample(orm_base.RowOfEvent, orm_base.Base):
     ns: Mapped[int]
 
 
-class Observation(orm_base.RowOfEvent, orm_base.Base):
+class Observation(RowOfEpisode, orm_base.Base):
     """An observation that a program made with `memory.observe`.
 
     Attributes:
@@ -843,8 +828,6 @@ class Observation(orm_base.RowOfEvent, orm_base.Base):
 
     __tablename__ = "observation"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(sa.ForeignKey("process_metadata.id"), index=True)
     node_id: Mapped[int | None] = mapped_column(sa.ForeignKey("task_tree_node.id"), index=True)
     name: Mapped[str] = mapped_column(index=True)
     time: Mapped[datetime]
@@ -854,7 +837,6 @@ class Observation(orm_base.RowOfEvent, orm_base.Base):
     items: Mapped[list[ObservationValue]] = orm_base.many_of(
         lambda: ObservationValue.id, "observation", order_by=lambda: ObservationValue.position
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     @property
     def values(self) -> dict[str, float | str | bool | None]:
