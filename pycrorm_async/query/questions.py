@@ -26,8 +26,10 @@ from typing import (
     ParamSpec,
     Self,
     TypeAlias,
+    TypedDict,
     TypeVar,
     Union,
+    Unpack,
     get_args,
     get_origin,
     get_type_hints,
@@ -125,7 +127,8 @@ class _Question(Generic[P]):
     @cached_property
     def _annotations(self) -> Mapping[str, Any]:
         """The annotations by argument: a type and a help. An `Episode` counts as a text."""
-        return get_type_hints(self.select_of, localns={"Episode": str}, include_extras=True)
+        hints_of = partial(get_type_hints, localns={"Episode": str}, include_extras=True)
+        return hints_of(self.select_of) | hints_of(FailureSearch)
 
     @cached_property
     def arguments(self) -> Mapping[str, Argument]:
@@ -139,11 +142,17 @@ class _Question(Generic[P]):
     @cached_property
     def signature(self) -> Signature:
         """The signature, with types in place of the names of annotations."""
-        types = {name: get_args(each)[0] for name, each in self._annotations.items() if name != "return"}
-        return Signature([each.replace(annotation=types[name]) for name, each in self._parameters()])
+        types = self._annotations
+        return Signature([each.replace(annotation=get_args(types[name])[0]) for name, each in self._parameters()])
 
     def _parameters(self) -> Iterable[tuple[str, Parameter]]:
-        return signature(self.select_of).parameters.items()
+        """Yield the parameters by name, those of a `FailureSearch` among them."""
+        for name, each in signature(self.select_of).parameters.items():
+            if each.kind is not Parameter.VAR_KEYWORD:
+                yield name, each
+                continue
+            for argument in FailureSearch.__annotations__:
+                yield argument, Parameter(argument, Parameter.KEYWORD_ONLY, default=None)
 
     @overload
     def __get__(self, ask: None, owner: Any) -> Self: ...
@@ -214,39 +223,41 @@ _WORDS_MAX = 30
 """Bounds the words of a search: each is a condition on four columns, and SQLite takes a thousand."""
 
 
-def _matching(
-    episode: Any,
-    *,
-    object: Any,  # noqa: A002  the column's name
-    arm: Any,
-    reason: Any,
-    message: Any,
-    text: Any,
-    recovered: Any,
-) -> list[sa.ColumnElement[bool]]:
+class FailureSearch(TypedDict, total=False):
+    """The failures that a question is about: the arguments that three questions share."""
+
+    episode: Of
+    object: Named
+    arm: Arm
+    reason: Reason
+    message: Message
+    text: Words
+    recovered: Recovered
+    limit: Limit
+
+
+def _matching(search: FailureSearch) -> list[sa.ColumnElement[bool]]:
     """Return the conditions on `RootFailure`.
 
     A failure is searched by its columns, not by one bag of words: the milk's failure must not answer to `cereal`
     because the episode's description names both.
     """
-    failure = orm.RootFailure
-    conditions = [frames.of_episode(failure.process_metadata_id, episode)]
-    if object is not None:
-        conditions.append(frames.containing(object, failure.object))
-    if arm is not None:
-        conditions.append(frames.is_named(failure.arm, arm))
-    if reason is not None:
-        conditions.append(_is_reason(reason))
-    if message is not None:
-        conditions.append(frames.containing(message, failure.message))
-    if text is not None:
-        columns = failure.object, failure.arm, failure.message, failure.dtype
+    failure, columns = orm.RootFailure, orm.RootFailure.__table__.c
+    given: dict[str, Any] = {name: each for name, each in search.items() if each is not None}
+    conditions = [frames.of_episode(failure.process_metadata_id, given.get("episode"))]
+    conditions += [frames.containing(given[each], columns[each]) for each in ("object", "message") if each in given]
+    if "arm" in given:
+        conditions.append(frames.is_named(failure.arm, given["arm"]))
+    if "reason" in given:
+        conditions.append(_is_reason(given["reason"]))
+    if "text" in given:
         # Words that mean a class together, as in "out of reach", count together.
-        words = [text] if classes_meant_by(text) else text.split()
+        words = [given["text"]] if classes_meant_by(given["text"]) else given["text"].split()
         if len(words) > _WORDS_MAX:
             raise CallerError(f"text has {len(words)} words, and at most {_WORDS_MAX} are searched for")
-        conditions += [sa.or_(frames.containing(each, *columns), _is_reason(each)) for each in words]
-    return frames.needed(*conditions, frames.equal(failure.recovered, recovered))
+        searched = failure.object, failure.arm, failure.message, failure.dtype
+        conditions += [sa.or_(frames.containing(each, *searched), _is_reason(each)) for each in words]
+    return frames.needed(*conditions, frames.equal(failure.recovered, given.get("recovered")))
 
 
 def _is_reason(words: str) -> sa.ColumnElement[bool]:
@@ -423,17 +434,7 @@ class Ask(Generic[Q]):
 
     @_Question
     @staticmethod
-    def root_failures(
-        *,
-        episode: Of = None,
-        object: Named = None,  # noqa: A002  the column's name
-        arm: Arm = None,
-        reason: Reason = None,
-        message: Message = None,
-        text: Words = None,
-        recovered: Recovered = None,
-        limit: Limit = None,
-    ) -> Rows:
+    def root_failures(**search: Unpack[FailureSearch]) -> Rows:
         """List the nodes at which failures began.
 
         `outcome` says how the plan went on: recovered, tolerated, ignored, failed or open (`RootFailure.outcome`).
@@ -463,35 +464,19 @@ class Ask(Generic[Q]):
             failure.id.label("node_id"),
             failure.outcome,
         )
-        search = _matching(
-            episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
-        )
         # Not `order_by(failure.id)`, for which SQLite reads all nodes in order instead of the failed ones by an index.
-        return frames.limited(statement.where(*search).order_by(failure.id + 0), limit)
+        return frames.limited(statement.where(*_matching(search)).order_by(failure.id + 0), search.get("limit"))
 
     @_Question
     @staticmethod
-    def failures_by_cause(
-        *,
-        episode: Of = None,
-        object: Named = None,  # noqa: A002  the column's name
-        arm: Arm = None,
-        reason: Reason = None,
-        message: Message = None,
-        text: Words = None,
-        recovered: Recovered = None,
-        limit: Limit = None,
-    ) -> Rows:
+    def failures_by_cause(**search: Unpack[FailureSearch]) -> Rows:
         """Count failures by reason, type of the failed node and object, the most frequent first.
 
         The arguments are those of `root_failures`. A failure counts once, where it began, and in the column of its
         outcome.
         """
-        search = _matching(
-            episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
-        )
         names = "reason dtype object process_metadata_id start_time message outcome".split()
-        chosen = sa.select(*(getattr(orm.RootFailure, each) for each in names)).where(*search)
+        chosen = sa.select(*(getattr(orm.RootFailure, each) for each in names)).where(*_matching(search))
         # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them.
         # For one with a number PostgreSQL would rather have the first row early than read fewer nodes, and read all of
         # them.
@@ -510,30 +495,18 @@ class Ask(Generic[Q]):
             .group_by(*causes)
             .order_by(sa.func.count().desc(), *(each.nulls_first() for each in causes))
         )
-        return frames.limited(statement, limit)
+        return frames.limited(statement, search.get("limit"))
 
     @_Question
     @staticmethod
     def steps_before_failures(
-        *,
-        steps: Annotated[int, "Steps before each failure."] = 5,
-        episode: Of = None,
-        object: Named = None,  # noqa: A002  the column's name
-        arm: Arm = None,
-        reason: Reason = None,
-        message: Message = None,
-        text: Words = None,
-        recovered: Recovered = None,
-        limit: Limit = None,
+        *, steps: Annotated[int, "Steps before each failure."] = 5, **search: Unpack[FailureSearch]
     ) -> Rows:
         """List the last actions and motions that had ended before each failed node started, the latest first.
 
         `steps` is their number for each failure, 1 to 100; the other arguments are those of `root_failures`.
         """
         failure, step, count = orm.RootFailure, orm.TaskTreeNode, frames.checked_count("steps", steps, 100)
-        search = _matching(
-            episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
-        )
         latest = (
             sa.select(
                 failure.process_metadata_id.label("episode"),
@@ -544,7 +517,7 @@ class Ask(Generic[Q]):
                 _ended_before(failure.id, failure.process_metadata_id, failure.sequence).label("node_id"),
                 failure.id.label("failure_id"),
             )
-            .where(*search)
+            .where(*_matching(search))
             .cte("latest", recursive=True)
         )
         # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
@@ -569,7 +542,7 @@ class Ask(Generic[Q]):
                 step.duration.label("duration_s"),
                 step.id.label("node_id"),
             )
-            .join(step, sa.and_(*is_step, frames.of_episode(step.process_metadata_id, episode)))
+            .join(step, sa.and_(*is_step, frames.of_episode(step.process_metadata_id, search.get("episode"))))
             # Both hold of every step. PostgreSQL expects ten times as many steps as there are, and would read all nodes
             # to join them; with each range it expects a two-hundredth of that, and looks the steps up by their ids.
             .where(
@@ -580,7 +553,7 @@ class Ask(Generic[Q]):
             )
             .order_by(latest.c.failure_id, latest.c.steps_before)
         )
-        return frames.limited(statement, limit)
+        return frames.limited(statement, search.get("limit"))
 
     # --- actions ----------------------------------------------------------------------------------------------
 
