@@ -154,11 +154,11 @@ class DynamicClasses:
 
     def _rename(self) -> bool:
         """Move generated classes to the new names of their types; return whether any was moved."""
-        moved = [(old, new) for old, new in self._renamed.items() if old in self._classes and new not in self._classes]
-        for old, new in moved:
-            if new not in self._classes:
+        before = set(self._classes)
+        for old, new in self._renamed.items():
+            if old in self._classes and new not in self._classes:
                 self._classes[new], self._fields[new] = self._classes.pop(old), self._fields.pop(old)
-        return bool(moved)
+        return before != set(self._classes)
 
     def _shared(self, dtype: str) -> type[Designator] | None:
         """Return the class that all memories of this process share, by the type's name or one of its tables."""
@@ -221,19 +221,14 @@ class DynamicClasses:
         return root
 
     def _add_fields(self, dtype: str, class_: type[Designator], fields: Iterable[FieldDeclared]) -> bool:
-        present = self._fields[dtype]
-        before = len(present)
-        for field in fields:
-            if field.name in present:
-                continue
-            present.add(field.name)
+        added = [each for each in fields if each.name not in self._fields[dtype]]
+        for field in added:
             if not class_.__mapper__.has_property(field.name):  # a base's attribute has the same value
                 self._add_field(class_, field)
-        grown = len(present) > before
-        if grown:
-            for engine in self._engines:
-                engine.clear_compiled_cache()
-        return grown
+        self._fields[dtype] |= {each.name for each in added}
+        for engine in self._engines if added else ():
+            engine.clear_compiled_cache()
+        return bool(added)
 
     def _add_field(self, class_: type[Designator], field: FieldDeclared) -> None:
         if field.type in ("list", "dict"):

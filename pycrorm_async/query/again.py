@@ -45,14 +45,14 @@ from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.plan import objects
 from pycrorm_async.plan.field_types import ARGUMENTS
 from pycrorm_async.plan.language import Designator
+from pycrorm_async.query.scene import boxed_urdf
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.record.declarations import FieldShape, shape_of
 from pycrorm_async.record.plan_types import Parameter, Unresolved, declared_type, parameters_of
-from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.bullet import BulletWorld, Object
-from pycrorm_async.world.model_boxes import with_boxes, with_mesh_files
+from pycrorm_async.world.model_boxes import with_mesh_files
 from pycrorm_async.world.models import built_in_that_fits, point_urdf
-from pycrorm_async.world.pose import DuplicateName, ObjectType, Pose, Vector, WorldMode
+from pycrorm_async.world.pose import DuplicateName, ObjectType, Pose, WorldMode
 from pycrorm_async.world.urdf import robot_description
 
 _log = logging.getLogger("pycrorm_async")
@@ -444,7 +444,6 @@ def _recorded_shape(description: DescriptionDeclared, contents: Mapping[str, byt
         raise ValueError(description.missing)
     if not description.meshes:
         return _Shape(description.text)
-    boxes = {link: BoundingBox(Vector(*box.min), Vector(*box.max)) for link, box in description.boxes.items()}
     present = [each for each in description.meshes if each.sha256 in contents]
-    urdf = with_boxes(description.text, boxes, kept=frozenset(each.reference for each in present))
+    urdf = boxed_urdf(description, kept=frozenset(each.reference for each in present))
     return _Shape(urdf, meshes={each.reference: f"{each.sha256}{Path(each.name).suffix}" for each in present})

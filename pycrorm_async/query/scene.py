@@ -99,7 +99,7 @@ def object_model(description: DescriptionDeclared, *, drawn: frozenset[str] = fr
     if description.missing is not None:
         return point_model(f"its description is missing: {description.missing}")
     try:
-        return _document(read_model(_without_meshes(description, drawn)))
+        return _document(read_model(boxed_urdf(description, kept=drawn)))
     except (ValueError, ParseError) as error:
         return point_model(f"its description cannot be read: {error}")
 
@@ -132,11 +132,12 @@ def assumed_model(name: str, object_type: str, joints: set[str]) -> dict[str, An
     return point_model(reason)
 
 
-def _without_meshes(description: DescriptionDeclared, drawn: frozenset[str]) -> str:
+def boxed_urdf(description: DescriptionDeclared, *, kept: frozenset[str]) -> str:
+    """Return the URDF of a description with the box around its link in the place of each mesh that is not kept."""
     if "<mesh" not in description.text:
         return description.text
     boxes = {link: BoundingBox(Vector(*box.min), Vector(*box.max)) for link, box in description.boxes.items()}
-    return with_boxes(description.text, boxes, kept=drawn)
+    return with_boxes(description.text, boxes, kept=kept)
 
 
 def _document(model: Model) -> dict[str, Any]:
