@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 from datetime import UTC, datetime, timedelta
@@ -339,7 +338,9 @@ async def test_the_sql_of_each_question_returns_its_rows(reading: Reading, fille
     texts = [each.sql for each in questions]  # compiled at each access
     by_hand = ask_each(filled_url, texts)
     for each, text, rows in zip(questions, texts, by_hand, strict=True):
-        assert len(rows) == len(await each.rows()), text
+        frame = await each
+        assert len(rows) == len(await each.rows()) == len(frame), text
+        assert list(frame.columns) == list(each.statement.selected_columns.keys())
         assert str(each) == text
     of_three, of_identity, of_last = (by_hand[start * len(QUESTIONS) :][: len(QUESTIONS)] for start in range(1, 4))
     assert of_three == of_identity
@@ -358,14 +359,6 @@ async def test_a_statement_names_an_episode_by_its_number_or_its_whole_id(readin
         for attribute in ("statement", "sql"):
             with pytest.raises(CallerError, match=f"by its number, its whole id or `last`, got '{name}'"):
                 getattr(question, attribute)
-
-
-async def test_a_question_is_awaited_for_a_frame_of_its_columns(reading: Reading) -> None:
-    for name in QUESTIONS:
-        question = getattr(reading.ask, name)(**ARGUMENTS.get(name, {}))
-        frame = await question
-        assert list(frame.columns) == list(question.statement.selected_columns.keys())
-        assert len(frame) == len(await question.rows())
 
 
 @pytest.mark.soak_on("postgresql")
@@ -454,24 +447,6 @@ async def test_a_question_to_a_closed_memory_is_refused_and_opens_no_connection(
         await reading.query("SELECT 1")
 
 
-def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -> None:
-    with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
-        note = memory.recording.type("action", "NoteAction", {"text": str})
-        with memory.recording.episode(description="notes") as episode:
-            for number in range(3):
-                episode.start(number, note, {"text": "a"})
-                episode.end(number, "FAILED" if number == 1 else "SUCCEEDED", "broken" if number == 1 else None)
-        memory.flush()
-        question = memory.ask.durations(episode="last")
-        assert [(each.dtype, each.times, each.failed) for each in question.rows()] == [("NoteAction", 3, 1)]
-        assert question.frame()["succeeded"].tolist() == [2]
-        assert "GROUP BY" in question.sql
-        assert memory.query("SELECT count(*) FROM action").rows == [(3,)]
-    with pytest.raises(CallerError, match="not open"):
-        memory.ask.durations()
-    assert list(itertools.islice(QUESTIONS, 2)) == ["root_failures", "failures_by_cause"]
-
-
 # --- names that are not ASCII, or not as they are written -----------------------------------------------------
 
 
@@ -492,6 +467,8 @@ def test_names_are_found_whatever_their_letters_are(database_url: str, tmp_path:
         for name, moves in (("Äpfel", 1), ("ÄPFEL", 1), ("Äpfe_", 0), ("50%_a/B", 0), ("50%aA/b", 0)):
             assert len(ask.moves_of(name).rows()) == moves, name
         assert [each.what for each in ask.object_history("Äpfel").rows()] == ["added", "moved"]
+        assert ask.durations(episode="last").frame()["failed"].tolist() == [1]
+        assert "GROUP BY" in ask.durations().sql
         assert [each.what for each in ask.object_history("50%_a/B").rows()] == ["added"]
         for part, failures in (("NO Äpf", 1), ("%_a/B", 1), ("50__A/b", 0), ("Ä%l", 0)):
             assert len(ask.root_failures(message=part).rows()) == failures, part

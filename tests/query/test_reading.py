@@ -160,22 +160,6 @@ async def test_a_memory_that_is_missing_or_has_no_tables_is_unavailable(log: Eve
 # --- frames -------------------------------------------------------------------------------------------------------
 
 
-async def test_a_frame_of_the_view_has_its_columns_and_names_of_enum_members(reading: Reading) -> None:
-    frame = await reading.dataframe(select(PickUpWithContextView).order_by(PickUpWithContextView.id))
-    assert list(frame.columns) == [
-        "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
-        "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
-        "object_x", "object_y", "robot_in_object_x", "robot_in_object_y", "sequence",
-    ]  # fmt: skip
-    assert frame.to_dict("records")[0] == {
-        "id": row(6), "arm": "LEFT", "grasp": "TOP", "torso_height": 0.25, "relative_x": -0.5, "relative_y": -2.0,
-        "quaternion_x": 0.0, "quaternion_y": 0.0, "quaternion_z": 0.0, "quaternion_w": 1.0, "obj_type": "MILK",
-        "status": "FAILED", "process_metadata_id": 1, "node_id": row(6),
-        "object_x": -0.5, "object_y": -2.0, "robot_in_object_x": -0.5, "robot_in_object_y": -2.0, "sequence": 6,
-    }  # fmt: skip
-    assert len(frame) == 2
-
-
 async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Reading) -> None:
     frame = await reading.dataframe(select(NavigateAction))
     assert list(frame.columns) == [

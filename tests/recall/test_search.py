@@ -177,29 +177,8 @@ def test_random_cues_find_the_cases_of_brute_force_in_its_order(
     assert answers > cues / 2, "most cues have an answer"
 
 
-def test_a_type_alone_returns_its_newest_cases() -> None:
-    cue = Cue(type="PickUpAction", k=5)
-    newest = sorted(
-        ((case.started_us, case.node) for case in CASES if case.type == "PickUpAction" and not case.simulated),
-        reverse=True,
-    )
-    assert found(cue, library_of(CASES, random.Random(1))) == [(1.0, node) for _, node in newest[:5]]
-
-
 def test_a_library_without_cases_has_no_answer() -> None:
     assert found(Cue(type="PickUpAction", has=(("arm", "LEFT"),), near=(Wanted("height", 1.0),)), CaseLibrary()) == []
-
-
-def test_a_word_that_no_case_has_cannot_hide_a_case_that_matches_all_else() -> None:
-    cases = [
-        Case(row_id(1, n, 0), n, "A", {"arm": "LEFT", "object_type": "MILK" if n % 2 else "BOWL"}, {}, "FAILED")
-        for n in range(1, 101)
-    ]
-    library = CaseLibrary([CaseBlock.of(cases)])
-    cue = Cue(type="A", has=(("arm", "LEFT"), ("object_type", "CACTUS")))
-    weights = weights_of(cue, library)
-    assert weights.never_seen == (("object_type", "CACTUS"),)
-    assert weights.words == pytest.approx((0.1, 3.0))
 
 
 def test_a_common_cue_ends_in_the_newest_rows(monkeypatch: pytest.MonkeyPatch) -> None:

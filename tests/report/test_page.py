@@ -179,14 +179,6 @@ def test_print_has_the_map_all_rows_and_all_panels(chrome: Browser, pages: dict[
         assert_quiet(tab, pages["plan"])
 
 
-def test_the_page_of_a_lost_episode_shows_the_world_at_its_last_event(chrome: Browser, pages: dict[str, Path]) -> None:
-    with chrome.open(pages["dies"]) as tab:
-        assert tab.ask("document.getElementById('status').textContent") == "? LOST"
-        assert tab.ask("pycrormPage.episode.presentAt(pycrormPage.event).length") == 4
-        assert tab.ask("pycrormPage.episode.nodes[0].status") == "LOST"
-        assert_quiet(tab, pages["dies"])
-
-
 def test_recorded_text_is_never_markup(opened: Tab, pages: dict[str, Path]) -> None:
     description = "Bring the milk </script><b onload=alert(1)>"
     assert pages["plan"].read_text().count("</script>") == 3
@@ -663,20 +655,3 @@ async def test_long_names_and_control_characters_leave_room_for_the_rest(
         assert tab.ask("[...document.querySelectorAll('#map text')].some((each) => each.textContent.endsWith('…'))")
         widest = "Math.max(...[...document.querySelectorAll('#map text')].map((each) => each.getBBox().width))"
         assert tab.ask(f"{widest} <= 1.1 * document.querySelector('#map svg').viewBox.baseVal.width")
-
-
-def test_a_capsule_has_round_ends(chrome: Browser, pages: dict[str, Path]) -> None:
-    corners = """(() => {
-      const model = { root: "base", joints: [], shapes: { base: [["capsule", [0.3, 1], [0, 0, 0], [0, 0, 0], null]] } };
-      const { group } = new (pycrormPage.bodies.of(pycrormPage.episode.objects[0]).constructor)({}, model);
-      let positions = [];
-      group.traverse((each) => each.isMesh && (positions = [...each.geometry.attributes.position.array]));
-      return positions;
-    })()"""
-    with chrome.open(pages["drives"]) as tab:
-        numbers = tab.ask(corners)
-    points = [numbers[at : at + 3] for at in range(0, len(numbers), 3)]
-    assert max(z for _, _, z in points) == pytest.approx(0.8)
-    assert min(z for _, _, z in points) == pytest.approx(-0.8)
-    for x, y, z in points:
-        assert (x * x + y * y + (abs(z) - 0.5) ** 2) ** 0.5 == pytest.approx(0.3)

@@ -80,26 +80,6 @@ def test_mistakes_are_one_line_and_leave_no_file(recorded: Path, arguments: tupl
 
 
 @pytest.mark.slow
-def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
-    done = pycrorm("report", "1", cwd=tmp_path)
-    assert done.returncode == 3
-    assert "pycrorm.db" in one_line_of(done)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path: Path) -> None:
-    out = tmp_path / "my robots.html"
-    done = pycrorm("report", "--all", "--out", out, "--json", cwd=recorded)
-    assert json.loads(done.stdout) == {"file": str(out), "episodes": 3, "pages": 3, "left_out": 0, "unreadable": {}}
-    names = [each.name for each in sorted((tmp_path / "my robots.pages").iterdir())]
-    assert names == ["episode-1.html", "episode-2.html", "episode-3.html"]
-    again = pycrorm("report", "--all", "--out", out, cwd=recorded)
-    assert one_line_of(again) == f"pycrorm: {out} exists: add --force to replace it, or give another name"
-    assert pycrorm("report", "--all", "--out", out, "--force", cwd=recorded).returncode == 0
-
-
-@pytest.mark.slow
 def test_a_table_of_many_episodes_has_the_newest_and_says_how_many_it_left_out(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
