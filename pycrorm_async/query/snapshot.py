@@ -27,15 +27,8 @@ from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import DescriptionDeclared, EpisodeEnded
 from pycrorm_async.projections.fold import happening_of
-from pycrorm_async.query.named_queries import (
-    EpisodeSummary,
-    NodeSummary,
-    Percept,
-    PlaceSearch,
-    depth_first,
-    percepts_in,
-    search_in,
-)
+from pycrorm_async.query import named_queries
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch
 from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.replay import LATEST_MAX, EpisodeReplay, ReplayedNode, WorldObject
 from pycrorm_async.query.text import NotebookValue
@@ -377,7 +370,7 @@ def moment_of(
         meshes: contents of their mesh files, by SHA-256.
     """
     started, number = replay.started, replay.number
-    percepts = [each for answer in replay.detections for each in percepts_in(number, *answer)]
+    percepts = [each for answer in replay.detections for each in named_queries.percepts_in(number, *answer)]
     return Moment(
         number=number,
         id=replay.id,
@@ -391,7 +384,7 @@ def moment_of(
         status=replay.status,
         tree=tuple(
             _node(replay, replay.nodes[sequence], depth)
-            for sequence, depth in depth_first({sequence: each.parent for sequence, each in replay.nodes.items()})
+            for sequence, depth in named_queries.depth_first({key: each.parent for key, each in replay.nodes.items()})
         ),
         world=_world(replay, descriptions, meshes),
         observations={
@@ -406,7 +399,7 @@ def moment_of(
         },
         tags=replay.tags,
         percepts=tuple(percepts[-LATEST_MAX:]),
-        places=tuple(search_in(number, *answer) for answer in replay.searches),
+        places=tuple(named_queries.search_in(number, *answer) for answer in replay.searches),
     )
 
 
