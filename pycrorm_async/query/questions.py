@@ -9,32 +9,14 @@ what its values are, is in its annotation.
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from enum import Enum
 from functools import cached_property, partial, wraps
 from inspect import Parameter, Signature, signature, unwrap
 from types import UnionType
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Generic,
-    Literal,
-    NamedTuple,
-    NoReturn,
-    ParamSpec,
-    Self,
-    TypeAlias,
-    TypedDict,
-    TypeVar,
-    Union,
-    Unpack,
-    get_args,
-    get_origin,
-    get_type_hints,
-    overload,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NamedTuple, TypedDict, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.orm import aliased
@@ -53,7 +35,7 @@ from pycrorm_async.record.values import SAMPLES
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
-Rows: TypeAlias = "sa.Select[*tuple[Any, ...]]"
+Rows: typing.TypeAlias = "sa.Select[*tuple[Any, ...]]"
 
 # === arguments ================================================================================================
 #
@@ -97,18 +79,18 @@ class Argument(NamedTuple):
 
 def _simple(annotation: Any) -> Any:
     """Return the type as which texts name a value: that of a member of an enum or an episode is str."""
-    if get_origin(annotation) not in (Union, UnionType):
+    if typing.get_origin(annotation) not in (typing.Union, UnionType):
         return annotation
-    types = get_args(annotation)
+    types = typing.get_args(annotation)
     return str if str in types else next(each for each in types if each is not type(None))
 
 
 def _choices(annotation: Any) -> tuple[str, ...]:
-    enum = next((each for each in get_args(annotation) if each in (TaskStatus, ObjectType, Grasp)), None)
+    enum = next((each for each in typing.get_args(annotation) if each in (TaskStatus, ObjectType, Grasp)), None)
     return tuple(enum.__members__) if enum is not None else ()
 
 
-P = ParamSpec("P")
+P = typing.ParamSpec("P")
 Q = TypeVar("Q")
 
 
@@ -125,25 +107,25 @@ class _Question(Generic[P]):
         self.name = name
 
     @cached_property
-    def _annotations(self) -> Mapping[str, Any]:
-        """The annotations by argument: a type and a help. An `Episode` counts as a text."""
-        hints_of = partial(get_type_hints, localns={"Episode": str}, include_extras=True)
-        return hints_of(self.select_of) | hints_of(FailureSearch)
+    def _described(self) -> Mapping[str, tuple[Any, str]]:
+        """Type and help by argument. An `Episode` counts as a text."""
+        hints_of = partial(typing.get_type_hints, localns={"Episode": str}, include_extras=True)
+        hints = {**hints_of(self.select_of), **hints_of(FailureSearch)}
+        return {name: typing.get_args(each) for name, each in hints.items() if name != "return"}
 
     @cached_property
     def arguments(self) -> Mapping[str, Argument]:
         """The arguments by name, in the order of the signature."""
-        described = {name: (get_args(self._annotations[name]), each.default) for name, each in self._parameters()}
         return {
-            name: Argument(name, _simple(type_), words, each, _choices(type_))
-            for name, ((type_, words), each) in described.items()
+            name: Argument(name, _simple(type_), words, each.default, _choices(type_))
+            for name, each in self._parameters()
+            for type_, words in [self._described[name]]
         }
 
     @cached_property
     def signature(self) -> Signature:
         """The signature, with types in place of the names of annotations."""
-        types = self._annotations
-        return Signature([each.replace(annotation=get_args(types[name])[0]) for name, each in self._parameters()])
+        return Signature([each.replace(annotation=self._described[name][0]) for name, each in self._parameters()])
 
     def _parameters(self) -> Iterable[tuple[str, Parameter]]:
         """Yield the parameters by name, those of a `FailureSearch` among them."""
@@ -154,9 +136,9 @@ class _Question(Generic[P]):
             for argument in FailureSearch.__annotations__:
                 yield argument, Parameter(argument, Parameter.KEYWORD_ONLY, default=None)
 
-    @overload
-    def __get__(self, ask: None, owner: Any) -> Self: ...
-    @overload
+    @typing.overload
+    def __get__(self, ask: None, owner: Any) -> typing.Self: ...
+    @typing.overload
     def __get__(self, ask: Ask[Q], owner: Any) -> Callable[P, Q]: ...
     def __get__(self, ask: Ask[Q] | None, owner: Any) -> Any:
         if ask is None:
@@ -427,14 +409,14 @@ class Ask(Generic[Q]):
 
     if not TYPE_CHECKING:
 
-        def __getattr__(self, name: str) -> NoReturn:
+        def __getattr__(self, name: str) -> typing.NoReturn:
             raise AttributeError(f"there is no question {name}{nearest(name, QUESTIONS)}")
 
     # --- failures ---------------------------------------------------------------------------------------------
 
     @_Question
     @staticmethod
-    def root_failures(**search: Unpack[FailureSearch]) -> Rows:
+    def root_failures(**search: typing.Unpack[FailureSearch]) -> Rows:
         """List the nodes at which failures began.
 
         `outcome` says how the plan went on: recovered, tolerated, ignored, failed or open (`RootFailure.outcome`).
@@ -469,7 +451,7 @@ class Ask(Generic[Q]):
 
     @_Question
     @staticmethod
-    def failures_by_cause(**search: Unpack[FailureSearch]) -> Rows:
+    def failures_by_cause(**search: typing.Unpack[FailureSearch]) -> Rows:
         """Count failures by reason, type of the failed node and object, the most frequent first.
 
         The arguments are those of `root_failures`. A failure counts once, where it began, and in the column of its
@@ -500,7 +482,7 @@ class Ask(Generic[Q]):
     @_Question
     @staticmethod
     def steps_before_failures(
-        *, steps: Annotated[int, "Steps before each failure."] = 5, **search: Unpack[FailureSearch]
+        *, steps: Annotated[int, "Steps before each failure."] = 5, **search: typing.Unpack[FailureSearch]
     ) -> Rows:
         """List the last actions and motions that had ended before each failed node started, the latest first.
 
