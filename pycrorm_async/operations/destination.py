@@ -104,7 +104,8 @@ class LogAndTables:
     ) -> Mapping[EpisodeId, str]:
         if self._spool is None:
             return await self.log.append(records, on_wait)
-        await self.log.store_blobs(records)  # before this process' turn, so that others need not wait for large blobs
+        # Before this process' turn, so that others need not wait for large blobs.
+        await self.log.blobs.store_for(records)
         async with self._appending:
             for _ in range(_HEALINGS_MAX):
                 if self._heads is None:

@@ -28,6 +28,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from hashlib import sha256
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Final, NamedTuple, Protocol
 
@@ -60,14 +61,6 @@ _CHECKED_AT_ONCE: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
-class SortedBatch:
-    """A batch split into declarations, by fingerprint, and episodes, each in the order of arrival."""
-
-    declarations: dict[str, bytes]
-    episodes: dict[EpisodeId, list[Record]]
-
-
-@dataclass(frozen=True, slots=True)
 class EpisodeStep:
     """The effect of a batch on one episode: the row afterwards, the records to insert, and the repeats to compare.
 
@@ -80,8 +73,11 @@ class EpisodeStep:
     skipped_ends: int = 0
 
 
-def sort(records: Iterable[Record]) -> SortedBatch:
-    """Split a batch by episode. Raises `DamageError` for a record without an episode that is not a declaration."""
+def sort(records: Iterable[Record]) -> tuple[dict[str, bytes], dict[EpisodeId, list[Record]]]:
+    """Split a batch into declarations, by fingerprint, and episodes, each in the order of arrival.
+
+    Raises `DamageError` for a record without an episode that is not a declaration.
+    """
     declarations: dict[str, bytes] = {}
     episodes: dict[EpisodeId, list[Record]] = {}
     for record in records:
@@ -93,7 +89,7 @@ def sort(records: Iterable[Record]) -> SortedBatch:
             episodes[episode].append(record)
         else:
             episodes[episode] = [record]
-    return SortedBatch(declarations, episodes)
+    return declarations, episodes
 
 
 def step(records: Sequence[Record], row: storeds.EpisodeRow) -> EpisodeStep:
@@ -102,16 +98,6 @@ def step(records: Sequence[Record], row: storeds.EpisodeRow) -> EpisodeStep:
     if first == row.head + 1 and _is_whole(records):
         return EpisodeStep(_advanced(row, records, refused=None), list(records))
     return _careful_step(records, row)
-
-
-def differing(again: Iterable[Record], stored: Mapping[int, storeds.StoredEvent]) -> int | None:
-    """Return the first sequence whose stored event differs from the record; None if all are equal."""
-    return min((each.sequence for each in again if not _same(each, stored.get(each.sequence))), default=None)
-
-
-def _same(record: Record, stored: storeds.StoredEvent | None) -> bool:
-    # From the type on, a record and a stored event have the same fields in the same order.
-    return stored is not None and tuple(record[3:]) == tuple(stored[2:])
 
 
 def _careful_step(records: Sequence[Record], row: storeds.EpisodeRow) -> EpisodeStep:
@@ -325,7 +311,7 @@ class Appending:
         self._digests = digests
         self._witness = witness
         self._numbers = numbers
-        self._batch = sort(records)
+        self._declarations, self.episodes = sort(records)
         self._plan: _Plan | None = None
         self.warnings: dict[str, str] = {}
         """Warnings of limits that the batch came near, by "numbers" or an episode's id."""
@@ -344,10 +330,10 @@ class Appending:
         Raises `LogWentBack` if the log holds less of the witness than it had confirmed, and `LogDamaged` if another
         event is stored under a record's key; the caller must then roll back.
         """
-        batch, dialect = self._batch, self._dialect
-        if batch.declarations:
-            await _insert_declarations(dialect, connection, batch.declarations)
-        if not batch.episodes:
+        dialect = self._dialect
+        if self._declarations:
+            await _insert_declarations(dialect, connection, self._declarations)
+        if not self.episodes:
             await dialect.force_durable_commit(connection)  # all declarations may be repeats
             return storeds.Stored({}, {})
         known_rows, refusals = await self._read_or_create_rows(connection)
@@ -375,16 +361,16 @@ class Appending:
         else:
             await dialect.force_durable_commit(connection)
         await _compare(dialect, connection, [each for each in plan.steps.values() if each.again])
-        stopped = {
-            each: change.after.refused for each, change in plan.steps.items() if _has_unstored(batch, each, change)
-        }
-        refusals |= {each: reason for each, reason in stopped.items() if reason is not None}
+        for each, change in plan.steps.items():
+            count = len(change.fresh) + len(change.again) + change.skipped_ends
+            if count < len(self.episodes[each]) and change.after.refused is not None:
+                refusals[each] = change.after.refused
         return storeds.Stored(refusals, {each: change.after for each, change in plan.steps.items()})
 
     async def create_rows(self, connection: AsyncConnection) -> None:
         """Create the rows of the batch's new episodes, without events."""
         present = await self._read_rows(connection)
-        if self._batch.episodes.keys() <= present.keys():
+        if self.episodes.keys() <= present.keys():
             return
         rows, _ = await self._read_or_create_rows(connection)
         new = [(*row[:3], row.started_wall_ns, None, None) for each, row in rows.items() if each not in present]
@@ -393,7 +379,7 @@ class Appending:
     async def _make_plan(
         self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, storeds.EpisodeRow]
     ) -> _Plan:
-        steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
+        steps = {each: step(self.episodes[each], row) for each, row in known_rows.items()}
         extending = [known_rows[each] for each, change in steps.items() if change.fresh]
         digests = None if self._digests is None else await self._digests.begin(connection, extending)
         insertion = await self._dialect.event_insertion(_parts_of(steps.values(), digests))
@@ -401,7 +387,7 @@ class Appending:
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, storeds.EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""
-        names = {episode_text(each): each for each in self._batch.episodes}
+        names = {episode_text(each): each for each in self.episodes}
         witness, confirmed = self._witness or (None, 0)
         ids = [(each,) for each in names]
         if witness is None:
@@ -420,13 +406,13 @@ class Appending:
         """Read the rows, and create those of new episodes; return also why some episodes cannot get one."""
         rows = await self._read_rows(connection)
         refusals: dict[EpisodeId, str] = {}
-        missing = [each for each in self._batch.episodes if each not in rows]
+        missing = [each for each in self.episodes if each not in rows]
         restored: dict[EpisodeId, int] = {}
         for each, removed in (await removed_of(self._dialect, connection, missing)).items() if missing else ():
             missing.remove(each)
             if self._restoring and removed.archived_in is not None:
                 restored[each] = removed.number
-            elif removed.archived_in is None or self._batch.episodes[each][-1].sequence <= removed.head:
+            elif removed.archived_in is None or self.episodes[each][-1].sequence <= removed.head:
                 self.discarded[each] = removed
             else:
                 refusals[each] = str(removed)
@@ -441,7 +427,7 @@ class Appending:
             if number > most:
                 refusals[each] = f"all {most:,} episode numbers of this memory are used: {_room(most, _MOVE)}"
             else:
-                started_ns = self._batch.episodes[each][0].wall_ns
+                started_ns = self.episodes[each][0].wall_ns
                 rows[each] = storeds.EpisodeRow(
                     number, episode_text(each), head=0, folded=0, started_wall_ns=started_ns
                 )
@@ -471,29 +457,20 @@ async def removed_of(
 
 
 def _parts_of(steps: Iterable[EpisodeStep], digests: Extension | None) -> Iterator[tuple[int, list[Record]]]:
-    """Yield the new events in parts, each with its episode's number, and add these to the digests."""
+    """Yield the new events in parts, each with its episode's number, and add these to the digests.
+
+    An episode's end, and each tag behind it, is a part of its own, because it gets a digest.
+    """
     for each in steps:
-        number = each.after.number
-        for part, last in _parts(each):
+        number, events = each.after.number, each.fresh
+        last = len(events)
+        if each.after.ended_wall_ns is not None:
+            last = next((at for at in reversed(range(last)) if events[at].type == "EpisodeEnded"), 0)
+        starts = [*range(0, last, _PART_EVENTS), *range(last, len(events)), len(events)]
+        for start, end in pairwise(starts):
             if digests is not None:
-                digests.add(number, part, last=last)
-            yield number, part
-
-
-def _parts(change: EpisodeStep) -> Iterator[tuple[list[Record], bool]]:
-    """Split an episode's new events; yield each part, and whether it is the episode's end or a tag behind the end."""
-    events = change.fresh
-    last = len(events)
-    if change.after.ended_wall_ns is not None:
-        last = next((at for at in reversed(range(last)) if events[at].type == "EpisodeEnded"), 0)
-    for start in range(0, last, _PART_EVENTS):
-        yield events[start : min(start + _PART_EVENTS, last)], False
-    for at in range(last, len(events)):
-        yield events[at : at + 1], True
-
-
-def _has_unstored(batch: SortedBatch, episode: EpisodeId, change: EpisodeStep) -> bool:
-    return len(change.fresh) + len(change.again) + change.skipped_ends < len(batch.episodes[episode])
+                digests.add(number, events[start:end], last=start >= last)
+            yield number, events[start:end]
 
 
 async def _insert_declarations(
@@ -515,13 +492,14 @@ async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequenc
     if not steps:
         return
     keys = [(each.after.number, record.sequence) for each in steps for record in each.again]
-    stored: dict[int, dict[int, storeds.StoredEvent]] = {}
-    for event in await dialect.rows(connection, storeds.StoredEvent, schema.SELECT_EVENTS_BY_KEY, keys=keys):
-        stored.setdefault(event.number, {})[event.sequence] = event
+    rows = await dialect.rows(connection, storeds.StoredEvent, schema.SELECT_EVENTS_BY_KEY, keys=keys)
+    # From the type on, a record and a stored event have the same fields in the same order.
+    stored = {(each.number, each.sequence): each[2:] for each in rows}
     for each in steps:
-        sequence = differing(each.again, stored.get(each.after.number, {}))
-        if sequence is not None:
-            raise LogDamaged(each.after.id, sequence, "another event is stored under this number already")
+        number = each.after.number
+        differing = [one.sequence for one in each.again if stored.get((number, one.sequence)) != one[3:]]
+        if differing:
+            raise LogDamaged(each.after.id, min(differing), "another event is stored under this number already")
 
 
 # === limits ===================================================================================================
@@ -655,11 +633,10 @@ class Blobs:
 
     async def complete(self, hashes: Iterable[str]) -> set[str]:
         """Return those of these blobs that are stored completely."""
+        asked, query = [(each,) for each in hashes], schema.SELECT_COMPLETE_BLOBS
         async with self._reading() as connection:
-            if not await self._exists(connection):
-                return set()
-            asked = [(each,) for each in hashes]
-            return set((await self._dialect.execute(connection, schema.SELECT_COMPLETE_BLOBS, hashes=asked)).scalars())
+            rows = await self._dialect.rows_if_created(connection, schema.BLOB, tuple, query, hashes=asked)
+        return {name for (name,) in rows}
 
     async def read(self, name: str) -> Blob | None:
         """Return a stored blob; None if it is missing or incomplete."""
@@ -688,17 +665,13 @@ class Blobs:
     async def _parts(self, name: str) -> AsyncIterator[_Part]:
         part, parts = 0, 1
         while part < parts:
+            asked = {"hash": name, "part": part}
             async with self._reading() as connection:
-                if not await self._exists(connection):
-                    return
-                row = (await self._dialect.execute(connection, schema.SELECT_BLOB, hash=name, part=part)).first()
-            if row is None:
+                rows = await self._dialect.rows_if_created(connection, schema.BLOB, _Part, schema.SELECT_BLOB, **asked)
+            if not rows:
                 return
-            parts, part = row.parts, part + 1
-            yield _Part(parts, row.media_type, bytes(row.content))
-
-    async def _exists(self, connection: AsyncConnection) -> bool:
-        return (await self._dialect.table_state(connection, schema.BLOB)).exists
+            parts, part = rows[0].parts, part + 1
+            yield rows[0]
 
 
 class _Part(NamedTuple):

@@ -16,6 +16,7 @@ import stat
 import uuid
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -163,18 +164,26 @@ class EventLog:
         """
         if not records:
             return storeds.Stored({}, {})
-        with self.translated():
-            await self.blobs.store_for(records)  # again, because the log may have lost them since
-            if not await self._has_shards():
-                return await self._append(records, on_wait=on_wait, witness=witness, numbers=numbers)
-            async with self.writing() as connection:  # before an event with its number is on a shard
-                rows = appends.Appending(self._dialect, records, numbers=numbers, restoring=self.blobs.restores)
-                await rows.create_rows(connection)
-            try:
-                return await self._append(records, on_wait=on_wait, witness=witness, numbers=numbers)
-            except appends.StoredAhead:
-                await self._adopt({each.episode for each in records if each.episode is not None})
-                return await self._append(records, witness=witness, numbers=numbers)
+        appending = partial(
+            appends.Appending,
+            self._dialect,
+            records,
+            self.digests,
+            on_wait=(lambda: None) if self.address.is_sqlite else on_wait,
+            witness=witness,
+            numbers=numbers,
+            restoring=self.blobs.restores,
+        )
+        await self.blobs.store_for(records)  # again, because the log may have lost them since
+        if not await self._has_shards():
+            return await self._append(appending())
+        async with self.writing() as connection:  # before an event with its number is on a shard
+            await appending().create_rows(connection)
+        try:
+            return await self._append(appending())
+        except appends.StoredAhead:
+            await self._adopt({each.episode for each in records if each.episode is not None})
+            return await self._append(appending(on_wait=lambda: None))
 
     async def _has_shards(self) -> bool:
         if self._shards is None:
@@ -187,29 +196,11 @@ class EventLog:
             ahead = await self.spans([storeds.Span(row.number, row.head, SEQUENCE_MAX)])
             if ahead:
                 records = [Record(0, row.identity, *each[1:]) for each in ahead]
-                await self._append(records, are_stored=True)
+                await self._append(appends.Appending(self._dialect, records, self.digests, are_stored=True))
                 _log.warning("%s: %d events that a crash left on a shard are adopted", self.address, len(ahead))
 
-    async def _append(
-        self,
-        records: Sequence[Record],
-        *,
-        on_wait: Callable[[], None] = lambda: None,
-        witness: tuple[EpisodeId, int] | None = None,
-        numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
-        are_stored: bool = False,
-    ) -> storeds.Stored:
-        appending = appends.Appending(
-            self._dialect,
-            records,
-            self.digests,
-            on_wait=(lambda: None) if self.address.is_sqlite else on_wait,
-            witness=witness,
-            numbers=numbers,
-            restoring=self.blobs.restores,
-            are_stored=are_stored,
-        )
-        if self._write_turn is not None and len(records) >= _MANY_EVENTS:
+    async def _append(self, appending: appends.Appending) -> storeds.Stored:
+        if self._write_turn is not None and sum(map(len, appending.episodes.values())) >= _MANY_EVENTS:
             async with self.reading() as connection:
                 await appending.prepare(connection)
         async with self.writing() as connection:
@@ -217,8 +208,7 @@ class EventLog:
         if self.digests is not None and appending.extension is not None:
             self.digests.keep(appending.extension)
         for episode, removed in appending.discarded.items():
-            count = sum(each.episode == episode for each in records)
-            self.discarded[removed.id] = self.discarded.get(removed.id, 0) + count
+            self.discarded[removed.id] = self.discarded.get(removed.id, 0) + len(appending.episodes[episode])
             if removed.archived_in is None:  # what was archived is stored there
                 appending.warnings[f"removed {removed.id}"] = f"events that arrive of it are discarded: {removed}"
         for subject, warning in appending.warnings.items():
@@ -226,11 +216,6 @@ class EventLog:
                 self._warned.add(subject)
                 _log.warning("%s: %s", self.address, warning)
         return stored
-
-    async def store_blobs(self, records: Sequence[Record]) -> None:
-        """Store the blobs that these records refer to, durable on return. `store` does so as well."""
-        with self.translated():
-            await self.blobs.store_for(records)
 
     async def heads(self, episodes: Sequence[EpisodeId]) -> dict[EpisodeId, storeds.EpisodeRow]:
         """Read the rows of these episodes, without those that have no stored event."""
@@ -240,24 +225,21 @@ class EventLog:
 
     async def skip_numbers(self, above: int) -> None:
         """Never assign the numbers up to `above` to new episodes."""
-        with self.translated():
-            async with self.writing() as connection:
-                await self._dialect.skip_numbers(connection, above)
+        async with self.writing() as connection:
+            await self._dialect.skip_numbers(connection, above)
 
     async def note_incarnation(self, noticed_wall_ns: int, noticed_by: str, reason: str) -> None:
         """Record that the log went back. Raises `DatabaseError` also if this role lacks the privilege."""
-        with self.translated():
-            async with self.writing() as connection:
-                await self._dialect.create_if_missing(connection, schema.INCARNATION)
-                incarnation = storeds.Incarnation(noticed_wall_ns, noticed_by, reason)
-                await self._dialect.execute(connection, schema.INSERT_INCARNATION, **incarnation._asdict())
+        async with self.writing() as connection:
+            await self._dialect.create_if_missing(connection, schema.INCARNATION)
+            incarnation = storeds.Incarnation(noticed_wall_ns, noticed_by, reason)
+            await self._dialect.execute(connection, schema.INSERT_INCARNATION, **incarnation._asdict())
 
     async def incarnations(self) -> list[storeds.Incarnation]:
         """Read each time the log went back, the oldest first."""
+        table, query = schema.INCARNATION, schema.SELECT_INCARNATIONS
         async with self.reading() as connection:
-            if not (await self._dialect.table_state(connection, schema.INCARNATION)).exists:
-                return []
-            return await self._dialect.rows(connection, storeds.Incarnation, schema.SELECT_INCARNATIONS)
+            return await self._dialect.rows_if_created(connection, table, storeds.Incarnation, query)
 
     async def placement(self) -> Placement:
         """Return the placement of the memory's rows."""
@@ -402,9 +384,10 @@ class EventLog:
         """
         async with self._write_turn or nullcontext():
             self._check_file()  # a new connection would write into the file of this name
-            async with self.engine.begin() as connection:
-                yield connection
-                await self._dialect.commit(connection)
+            with self.translated():
+                async with self.engine.begin() as connection:
+                    yield connection
+                    await self._dialect.commit(connection)
         self._check_file()
         self.writes += 1
 
