@@ -55,7 +55,7 @@ from pycrorm_async.events.types import (
     is_missing,
 )
 from pycrorm_async.projections.columns import OWN, Storage, column_type, physical_name
-from pycrorm_async.projections.fold import decode_events, stored_rows
+from pycrorm_async.projections.fold import Batch, decode_events, stored_rows
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.named_values import NamedValues
 from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, json_text, microseconds, row_of
@@ -427,8 +427,8 @@ class PackedProjection(EpisodeProjection):
 # Fold a batch of events with a custom projection; subclasses collect the results of the fold, and store them.
 
 
-class ProjectedBatch(ABC):
-    """A batch of a custom projection. Implements `Batch`.
+class ProjectedBatch(Batch):
+    """A batch of a custom projection.
 
     Args:
         projection: to fold with.
@@ -526,10 +526,6 @@ class ProjectedBatch(ABC):
         """Leave the folds of the episodes to the next batch. Subclasses prepare their statements, too."""
         while self._taken:
             self._folds.keep(*self._taken.popitem())
-
-    @abstractmethod
-    async def write(self, connection: AsyncConnection, generation: int) -> None:
-        """Write all rows in the caller's transaction. Raises `RowRefused`."""
 
 
 # === projection rows ==========================================================================================

@@ -6,7 +6,6 @@ they are; a process that has it catches up. A fault in one projection is logged,
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +22,7 @@ from pycrorm_async.events.codec import declaration_of, fingerprint, short_name
 from pycrorm_async.projections import pipeline as checkpoints
 from pycrorm_async.projections.columns import OWN, Layout, Storage, next_number
 from pycrorm_async.projections.custom import CustomRows, EpisodeFolds, PackedProjection, Projection, columns_of
+from pycrorm_async.projections.fold import Batch
 from pycrorm_async.projections.generations import (
     PROJECTION,
     Generation,
@@ -35,24 +35,23 @@ from pycrorm_async.projections.generations import (
 )
 from pycrorm_async.projections.mapped_tables import with_user_views
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import EpisodeRow
 
 _log = logging.getLogger("pycrorm_async.projections")
 _CHECK_S = 1.0
 """The least interval between two checks of all episodes for events that no batch of the tables has folded."""
-_COMPARED_MAX = 1_000
-"""Bounds the episodes that are compared to find a share that no process folds."""
 _CHECK_SHARE_MAX = 0.02
 """Bounds the share of time in which they are checked: 100,000 take 25 ms."""
 _CHECK_S_MAX = 10.0
 """Bounds the time until they are checked again, also after a check that a busy machine made slow."""
+_HELP_S: Final = 30.0
+"""The interval at which a process that has folded its share folds a batch of the others, and more if that is large."""
 
 
 def learner_of(projection: Projection) -> checkpoints.Learn:
     """Return the function that learns to fold into the tables of a projection."""
     folds = EpisodeFolds(projection)
 
-    def learn(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], checkpoints.Batch]]:
+    def learn(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         declared = {}
         for payload in payloads:
             try:
@@ -158,15 +157,6 @@ class _CustomFold(NamedTuple):
     projection: Projection
     target: checkpoints.SideTarget
     runner: checkpoints.FoldRunner
-    others: OtherShares
-
-    async def share(self, own: checkpoints.Share) -> checkpoints.Share:
-        """Return the share to fold: the own one, or all of them while one of the others is not folded."""
-        if own == checkpoints.WHOLE or not self.others.is_due:
-            return self.others.folded_with(own)
-        self.target.share = checkpoints.WHOLE
-        async with self.target.log.reading() as connection:
-            return self.others.compare(await self.target.behind(connection, 0, _COMPARED_MAX), own)
 
 
 class CustomTables:
@@ -181,6 +171,7 @@ class CustomTables:
         self._batch_events = batch_events
         self._folds: list[_CustomFold] = []
         self._due_s = 0.0
+        self._help_s = time.monotonic() + _HELP_S
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
         """Create missing tables; return whether the views must be created again.
@@ -201,7 +192,7 @@ class CustomTables:
             target = checkpoints.SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
             batch_events = events_of_batch(each, self._batch_events)
             runner = checkpoints.FoldRunner(target, learner_of(each), batch_events=batch_events)
-            self._folds.append(_CustomFold(each, target, runner, OtherShares()))
+            self._folds.append(_CustomFold(each, target, runner))
         return changed
 
     def companions(self, events: int, *, until_visible: bool) -> list[checkpoints.FoldRunner]:
@@ -218,21 +209,25 @@ class CustomTables:
     ) -> bool:
         """Fold a batch of this share of each projection; return False if none was behind.
 
-        Shares that no process folds are folded too, because the process of another share may not have the code.
+        The process of another share may not have the code. So one that has folded its own share folds the others at
+        intervals, and goes on while they are far behind.
 
         Unless `until_visible` is True, checks at intervals only: the batches of the tables leave few events, those of
         the package's own projections, of which a few cost as much as a thousand.
         """
-        loop = asyncio.get_running_loop()
-        time_s = loop.time()
+        time_s = time.monotonic()
         if not self._folds or not (until_visible or time_s >= self._due_s):
             return False
         count = most_events = 0
+        helps = share != checkpoints.WHOLE and time_s >= self._help_s
         for fold in [*self._folds]:
-            projection, target, runner, _ = fold
+            projection, target, runner = fold
             try:
-                target.share = await fold.share(share)
+                target.share = share
                 events = await runner.fold_next()
+                if events is None and helps:
+                    target.share = checkpoints.WHOLE
+                    events = await runner.fold_next()
                 count += events is not None
                 most_events = max(most_events, events or 0)
                 if (events or 0) < checkpoints.LOOKAHEAD_EVENTS_MIN:
@@ -244,7 +239,8 @@ class CustomTables:
                 await self._note_fault(fold, str(fault))
                 self._folds.remove(fold)
         if most_events < min(checkpoints.LOOKAHEAD_EVENTS_MIN, self._batch_events):
-            pause_s = 0 if count else (loop.time() - time_s) / _CHECK_SHARE_MAX
+            self._help_s = time_s + _HELP_S if helps else self._help_s
+            pause_s = 0 if count else (time.monotonic() - time_s) / _CHECK_SHARE_MAX
             self._due_s = time_s + min(max(pause_s, _CHECK_S), _CHECK_S_MAX)
         return count > 0
 
@@ -297,56 +293,3 @@ async def states(log: EventLog, projections: Sequence[Projection]) -> list[Proje
 
 def _names(layout: Layout) -> list[str]:
     return [name.removeprefix(OWN).lower() for name in (*layout.leaves, *layout.user_views)]
-
-
-# === other shares =============================================================================================
-#
-# A process has a share of the episodes of each projection too (`fold_group`), but another process may not have the
-# projection's code. If no episode of a share has moved between two comparisons `_STALL_S` apart, this process folds all
-# shares for `_HELP_S`.
-
-_STALL_S: Final = 20.0
-"""The time in which a process that folds has folded something: a batch takes a second, or ten on a busy machine."""
-_HELP_S: Final = 30.0
-"""The time for which all shares are folded when a process does not fold its own, until that is examined again."""
-
-
-class OtherShares:
-    """The shares of other processes, and whether one of them is not folded by its process."""
-
-    def __init__(self) -> None:
-        self._behind: Mapping[int, int] = {}
-        self._compared_s = self._help_until_s = float("-inf")
-
-    @property
-    def is_due(self) -> bool:
-        """Whether the episodes that are behind should be compared now."""
-        return time.monotonic() >= self._compared_s + _STALL_S
-
-    def compare(self, behind: Sequence[EpisodeRow], own: checkpoints.Share) -> checkpoints.Share:
-        """Compare with the episodes that were behind at the last call; return as `folded_with` does."""
-        now = {each.number: each.folded for each in behind}
-        self._compared_s = time.monotonic()
-        if is_stalled(self._behind, now, own.many):
-            self._help_until_s = self._compared_s + _HELP_S
-        self._behind = now
-        return self.folded_with(own)
-
-    def folded_with(self, own: checkpoints.Share) -> checkpoints.Share:
-        """Return the share to fold: the own one, or all of them while one of the others is not folded."""
-        return checkpoints.WHOLE if time.monotonic() < self._help_until_s else own
-
-
-def is_stalled(before: Mapping[int, int], now: Mapping[int, int], many: int) -> bool:
-    """Return whether all episodes of one of `many` shares that were behind have not been folded further.
-
-    Args:
-        before: by number, the folded sequence of the episodes that were behind.
-        now: the same, later.
-        many: the number of shares.
-
-    >>> is_stalled({1: 5, 2: 7}, {1: 6, 2: 7}, 2), is_stalled({1: 5, 2: 7, 4: 9}, {1: 6, 2: 7}, 2)
-    (True, False)
-    """
-    moving = {number % many for number, folded in before.items() if now.get(number) != folded}
-    return any(number % many not in moving for number in before)

@@ -60,14 +60,6 @@ class TableDifference(NamedTuple):
         return f"{self.table}.{self.column} is {self.stored!r}, and should be {self.expected!r}"
 
 
-class FoldedRows(Protocol):
-    """The rows that a fold makes of events."""
-
-    def to_insert(self) -> Mapping[tuple[str, tuple[str, ...]], Sequence[Row]]:
-        """Return the rows by (table, columns)."""
-        ...
-
-
 class EpisodeRange(NamedTuple):
     """The episodes with numbers from `first` up to but not including `end`; None is the end of the memory."""
 
@@ -114,12 +106,18 @@ class Comparison:
         return [*_compared(LINK_BOX, [*self._link_box.columns.keys()], folded, stored)]
 
     async def differences(
-        self, connection: AsyncConnection, rows: FoldedRows, episodes: EpisodeRange
+        self,
+        connection: AsyncConnection,
+        rows: Mapping[tuple[str, tuple[str, ...]], Sequence[Row]],
+        episodes: EpisodeRange,
     ) -> list[TableDifference]:
-        """Return the differences between the tables and the folded rows of these episodes, in the caller's snapshot."""
+        """Return the differences between the tables and the folded rows of these episodes, in the caller's snapshot.
+
+        `rows` are by (table, columns).
+        """
         self.count = 0
         folded = defaultdict[str, list[tuple[tuple[str, ...], Sequence[Row]]]](list)
-        for (name, columns), some in rows.to_insert().items():
+        for (name, columns), some in rows.items():
             folded[name].append((columns, some))
         differences: list[TableDifference] = []
         first, end = episodes

@@ -1,5 +1,6 @@
 """Turn events into rows, without reading a table."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import ParseError, fromstring
@@ -113,41 +114,29 @@ def decode_events(
 # --- episodes -------------------------------------------------------------------------------------------------
 
 
+_RECORDED_OF_EPISODE = (
+    *("created_by", "description", "host", "python", "plan", "world", "seed", "simulated", "continues"),
+    *("plan_sha256", "git_commit", "git_dirty", "clock_synchronized", "clock_error_us"),
+)
+"""The columns of an episode that are fields of its start."""
+
+
 def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: Designators, rows: Rows) -> None:
     if event.number in rows.episodes:
         raise CannotFold("the episode starts a second time")
     by = started.thought_by
     rows.episodes[event.number] = {
+        **dict.fromkeys(COLUMNS["process_metadata"]),  # of these, `name_episodes` sets `uuid` and the end others
+        **{name: getattr(started, name) for name in _RECORDED_OF_EPISODE},
         "id": event.number,
-        "uuid": None,  # `name_episodes` sets it
         "created_at": microseconds(event.wall_ns),
-        "created_by": started.created_by,
-        "description": started.description,
         "version": started.software,
-        "host": started.host,
-        "python": started.python,
-        "plan": started.plan,
-        "world": started.world,
-        "seed": started.seed,
         "status": "RUNNING",
         "start_ns": event.monotonic_ns,
-        "end_ns": None,
-        "end_sequence": None,
-        "failure_type": None,
-        "failure_message": None,
-        "simulated": started.simulated,
         "thought_by": by.episode if by else None,
         "thought_by_node": by.node if by else None,
-        "continues": started.continues,
-        "continued_in": None,
-        "plan_sha256": started.plan_sha256,
-        "git_commit": started.git_commit,
-        "git_dirty": started.git_dirty,
         "libraries": json_text(started.libraries) if started.libraries else None,
         "settings": json_text(started.settings) if started.settings else None,
-        "clock_synchronized": started.clock_synchronized,
-        "clock_error_us": started.clock_error_us,
-        "entered_world": None,
         "metadata": json_text(started.metadata) if started.metadata else None,
     }
     _tagging(event, started.tags, (), rows)
@@ -491,10 +480,46 @@ def name_episodes(rows: Rows, uuids: Mapping[int, str]) -> None:
             row["uuid"] = uuids[number]
 
 
-class TableRows:
-    """The rows of a batch of events in the built-in tables. Implements `Batch`."""
+class Batch(ABC):
+    """The rows of a batch of events.
+
+    Attributes:
+        reads: the types of the events that it folds; None: all types.
+    """
 
     reads: frozenset[str] | None = None
+
+    def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
+        """Return those of these spans before which `restore` needs to read no event."""
+        return spans
+
+    @abstractmethod
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
+        """Prepare for folding these spans, by reading the facts that the fold needs of the events before them."""
+
+    @abstractmethod
+    def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
+        """Add the rows of consecutive events of an episode, at least one; `happenings` are their decoded payloads.
+
+        Events of types that are not in `reads` may have no happening.
+
+        Returns the first event that cannot be folded, with the reason; of it and those behind it, no row is added.
+        """
+
+    async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:  # noqa: B027
+        """Read what these events name in others, before they are folded."""
+
+    @abstractmethod
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        """Prepare the statements for this generation, after the last event and before the transaction."""
+
+    @abstractmethod
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        """Write the rows. Raises `RowRefused`."""
+
+
+class TableRows(Batch):
+    """The rows of a batch of events in the built-in tables. The id of a row that an event names follows from it."""
 
     def __init__(self, designators: Designators) -> None:
         self._designators = designators
@@ -502,18 +527,12 @@ class TableRows:
         self._uuids: dict[int, str] = {}
         self._insertion: Insertion = None
 
-    def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
-        return spans
-
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
         """Read the UUIDs of the episodes that start in these spans. The caller may hold the write lock of SQLite."""
         starting = [span.number for span in spans if span.after == 0]
         if starting:
             async with log.reading() as connection:
                 self._uuids = await uuids_of(connection, starting)
-
-    async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
-        """Read nothing: the id of a row that an event names follows from the event."""
 
     def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
         designators, rows = self._designators, self._rows

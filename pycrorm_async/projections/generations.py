@@ -21,12 +21,12 @@ resume, and a row under `gone` all that it needs to drop the tables.
 """
 
 import logging
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 import sqlalchemy as sa
@@ -546,16 +546,12 @@ _SLICE = 1_000
 locks, and a table with its index, its TOAST table and its view takes up to five."""
 
 
-class GrowthTarget(Protocol):
-    """Protocol of the owner of a generation's row in `pycrorm_generation`, which can extend the tables."""
-
-    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-        """Create the tables and columns that only this layout has, and store the layout."""
-        ...
+Grow: TypeAlias = Callable[[AsyncConnection, Generation, Layout], Awaitable[Generation]]
+"""Creates the tables and columns that only this layout has, and stores the layout in the generation's row."""
 
 
 async def grow(
-    connection: AsyncConnection, target: GrowthTarget, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, grow_to: Grow, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
     """Create the tables of these declarations, up to one slice and without those that the database refuses.
 
@@ -563,7 +559,7 @@ async def grow(
     transaction back.
     """
     tables_max = _SLICE // (1 + (await dialect_of(connection).placement(connection)).partitions)
-    return await _grow(connection, target, generation, _slice(generation.layout, payloads, tables_max))
+    return await _grow(connection, grow_to, generation, _slice(generation.layout, payloads, tables_max))
 
 
 def _slice(layout: Layout, payloads: Sequence[bytes], tables_max: int) -> Sequence[bytes]:
@@ -580,14 +576,14 @@ def _slice(layout: Layout, payloads: Sequence[bytes], tables_max: int) -> Sequen
 
 
 async def _grow(
-    connection: AsyncConnection, target: GrowthTarget, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, grow_to: Grow, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
     united = unite(generation.layout, payloads)
     if united.layout == generation.layout:
         return generation
     try:
         async with connection.begin_nested():
-            grown = await target.grow(connection, generation, united.layout)
+            grown = await grow_to(connection, generation, united.layout)
             _log_contradictions(united, generation.layout)
             return grown
     except (ArgumentError, CompileError, IdentifierError) as error:  # SQLAlchemy cannot express the definition
@@ -599,16 +595,16 @@ async def _grow(
         reason = refusal
     if len(payloads) > 1:
         middle = len(payloads) // 2
-        generation = await _grow(connection, target, generation, payloads[:middle])
-        return await _grow(connection, target, generation, payloads[middle:])
+        generation = await _grow(connection, grow_to, generation, payloads[:middle])
+        return await _grow(connection, grow_to, generation, payloads[middle:])
     name = fingerprint(payloads[0])
     if name not in united.accepted:  # the declaration has no tables, so a view is at fault: raise its error
-        return await target.grow(connection, generation, united.layout)
+        return await grow_to(connection, generation, united.layout)
     dtype = united.accepted[name].dtype
     remedy = ": rename your table or view, then run `pycrorm rebuild`" if "already exists" in reason else ""
     reason = f"the database refuses the tables of {dtype}: {' '.join(reason.split())}{remedy}"
     unmade = generation.layout.unmade | {name: reason}
-    grown = await target.grow(connection, generation, msgspec.structs.replace(generation.layout, unmade=unmade))
+    grown = await grow_to(connection, generation, msgspec.structs.replace(generation.layout, unmade=unmade))
     _log.warning("%s; episodes that use this type are parked, all others continue", reason)
     return grown
 

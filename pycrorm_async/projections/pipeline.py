@@ -49,14 +49,14 @@ from operator import attrgetter
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from sqlalchemy import TableClause, column, or_, select, table, text, update
-from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged, PycrormError
 from pycrorm_async.events.ids import NUMBER_SHIFT, SEQUENCE_MAX, row_id_min
 from pycrorm_async.events.types import Happening
 from pycrorm_async.projections import generations
 from pycrorm_async.projections.columns import Layout, Storage, physical_name, unite
-from pycrorm_async.projections.fold import TableRows, decode_events
+from pycrorm_async.projections.fold import Batch, TableRows, decode_events
 from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
@@ -100,47 +100,12 @@ class BatchWorker(Protocol):
         ...
 
 
-class Batch(Protocol):
-    """The rows of a batch of events.
-
-    Attributes:
-        reads: the types of the events that it folds; None: all types.
-    """
-
-    reads: frozenset[str] | None
-
-    def continued(self, spans: Sequence[Span]) -> Sequence[Span]:
-        """Return those of these spans before which `restore` needs to read no event."""
-        ...
-
-    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Prepare for folding these spans, by reading the facts that the fold needs of the events before them."""
-        ...
-
-    def fold(self, events: Sequence[StoredEvent], happenings: Sequence[Happening | None]) -> tuple[int, str] | None:
-        """Add the rows of consecutive events of an episode, at least one; `happenings` are their decoded payloads.
-
-        Events of types that are not in `reads` may have no happening.
-
-        Returns the first event that cannot be folded, with the reason; of it and those behind it, no row is added.
-        """
-        ...
-
-    async def look_up(self, log: EventLog, events: Sequence[StoredEvent]) -> None:
-        """Read what these events name in others, before they are folded."""
-        ...
-
-    async def ready(self, engine: AsyncEngine, generation: int) -> None:
-        """Prepare the statements for this generation, after the last event and before the transaction."""
-        ...
-
-    async def write(self, connection: AsyncConnection, generation: int) -> None:
-        """Write the rows. Raises `RowRefused`."""
-        ...
-
-
 Learn: TypeAlias = Callable[[Layout, Sequence[bytes]], tuple[Layout, Callable[[], Batch]]]
 """Takes a layout and declarations; returns the layout that has them, and a factory of empty batches for it."""
+
+
+FoldTarget: TypeAlias = "LiveTarget | SideTarget"
+"""The generation into which a runner folds, with its checkpoints."""
 
 
 def learn_tables(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
@@ -413,7 +378,9 @@ class FoldRunner:
         if (generation.number, generation.revision) != (batch.number, types.revision):
             self.generation = generation
             return None
-        return await generations.grow(connection, self._target, generation, types.payloads) if growing else generation
+        if growing:
+            return await generations.grow(connection, self._target.grow, generation, types.payloads)
+        return generation
 
     async def _write_rows(
         self, connection: AsyncConnection, batch: _PreparedBatch, generation: generations.Generation
@@ -641,30 +608,10 @@ class Share(NamedTuple):
 WHOLE = Share()
 
 
-class FoldTarget(generations.GrowthTarget, Protocol):
-    """A generation to fold into, and its checkpoints. Methods with a connection run in the caller's transaction."""
-
-    log: EventLog
-
-    async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
-        """Return the episodes above number `after` whose events this generation lacks, without parked ones."""
-        ...
-
-    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
-        """Advance checkpoints and park episodes; return False if a checkpoint has moved: then roll back."""
-        ...
-
-    async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
-        """Read the generation and lock it until the transaction ends."""
-        ...
-
-    async def missing(self, number: int, sequence: int) -> str:
-        """Return the reason to park the episode whose event is missing in the log, or raise `LogDamaged`."""
-        ...
-
-
 class LiveTarget:
-    """The visible generation, with `episode.folded` as its checkpoints. Implements `FoldTarget`.
+    """The visible generation, with `episode.folded` as its checkpoints.
+
+    Methods with a connection run in the caller's transaction; those of `SideTarget` mean the same.
 
     Attributes:
         share: the episodes that this process folds.
@@ -676,10 +623,12 @@ class LiveTarget:
         self._known: generations.Generation | None = None
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
+        """Return the episodes above number `after` whose events this generation lacks, without parked ones."""
         values = {"after": after, "limit": limit, **self.share._asdict()}
         return await dialect_of(connection).rows(connection, EpisodeRow, SELECT_BEHIND, **values)
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
+        """Advance checkpoints and park episodes; return False if a checkpoint has moved: then roll back."""
         if steps and not await advance_folded(connection, steps):
             return False
         for number, reason in parked.items():
@@ -687,6 +636,7 @@ class LiveTarget:
         return True
 
     async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
+        """Read the generation and lock it until the transaction ends."""
         known = None if hold == "change" else self._known
         generation = await generations.current_generation(connection, hold=hold, known=known)
         if generation is None:
@@ -697,14 +647,16 @@ class LiveTarget:
     async def grow(
         self, connection: AsyncConnection, generation: generations.Generation, layout: Layout
     ) -> generations.Generation:
+        """Create the tables and columns that only this layout has, and store the layout."""
         return await generations.show(connection, await generations.grow_tables(connection, generation, layout))
 
-    async def missing(self, number: int, sequence: int) -> str:  # noqa: ARG002 - of the protocol
+    async def missing(self, number: int, sequence: int) -> str:  # noqa: ARG002 - of each target
+        """Return the reason to park the episode whose event is missing in the log; `SideTarget` raises `LogDamaged`."""
         return f"event {sequence} is missing in the log"
 
 
 class SideTarget:
-    """A generation with its own checkpoint table. Implements `FoldTarget`.
+    """A generation with its own checkpoint table.
 
     Args:
         log: with the events.

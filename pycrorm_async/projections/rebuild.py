@@ -285,7 +285,7 @@ async def _grow_slice(log: EventLog, target: SideTarget, payloads: Sequence[byte
     """Create one slice of the missing tables of these declarations; return the generation, unchanged if none was."""
     async with log.engine.begin() as connection:
         await dialect_of(connection).lock_log_changes(connection)
-        return await grow(connection, target, await target.generation(connection, "change"), payloads)
+        return await grow(connection, target.grow, await target.generation(connection, "change"), payloads)
 
 
 async def _resumable(

@@ -18,7 +18,6 @@ from pycrorm_async.events.types import EpisodeEnded, Happening, ObjectAdded, ref
 from pycrorm_async.projections import custom, custom_tables, findings, fold, pipeline
 from pycrorm_async.projections import generations as table_generations
 from pycrorm_async.projections.columns import OWN, Layout, unite
-from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import STATUS, CannotFold, Designators, Rows
 from pycrorm_async.store import schema, stored
 from pycrorm_async.store.address import no_tables
@@ -328,11 +327,10 @@ _PART_EVENTS = 4_000
 _PAGE_EVENTS = 4_000
 """Bounds the events that are read at once."""
 
-_BY_PREFIX = "SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5)"
-_FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")
-_DESCRIPTIONS = text(f"{_BY_PREFIX} = '{DESCRIPTION_PREFIX}'")
-_DESCRIPTIONS_READ = 100
-"""Bounds the descriptions read at once: each takes up to `record_bytes_max`."""
+_FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal")
+_DESCRIPTIONS = text(
+    f"SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5) = '{DESCRIPTION_PREFIX}'"  # noqa: S608
+)
 _TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number BETWEEN :first AND :last")
 # Looks up the index once for each gap between two episodes, because reading every event would take minutes.
 _GAPS = text("""
@@ -498,20 +496,14 @@ async def _check_database(log: EventLog, result: findings.VerifyResult) -> None:
             for reason in await dialect.faults_of_file(connection):
                 result.add_damage(None, None, reason)
             for name in (await connection.execute(_FINGERPRINTS)).scalars().all():
+                is_description = name.startswith(DESCRIPTION_PREFIX)
+                kind = "DescriptionDeclared" if is_description else "DesignatorTypeDeclared"
                 [payload] = await dialect.descriptions(connection, [name])  # by its name, which may be damaged too
-                if fingerprint(payload) != name:
-                    result.add_damage(None, None, f"the declaration {name} does not match its fingerprint")
-            described = sorted((await connection.execute(_DESCRIPTIONS)).scalars())
-            for first in range(0, len(described), _DESCRIPTIONS_READ):
-                part = described[first : first + _DESCRIPTIONS_READ]
-                payloads = await dialect.descriptions(connection, part)
-                matching = {fingerprint(payload, "DescriptionDeclared") for payload in payloads}
-                for payload in payloads:
-                    for reference in references_in("DescriptionDeclared", payload):
-                        result.blobs.setdefault(reference.hash, (None, None))
-                for name in part:
-                    if name not in matching:
-                        result.add_damage(None, None, f"the description {name} does not match its fingerprint")
+                if fingerprint(payload, kind) != name:
+                    noun = "description" if is_description else "declaration"
+                    result.add_damage(None, None, f"the {noun} {name} does not match its fingerprint")
+                for reference in references_in(kind, payload):
+                    result.blobs.setdefault(reference.hash, (None, None))
             for number in await _numbers_without_episode(connection):
                 result.add_damage(None, None, f"there are events of an episode {number}, which is not in the log")
     except DamageError as fault:
@@ -541,14 +533,9 @@ async def _numbers_without_episode(connection: AsyncConnection) -> list[int]:
 
 async def _stopped(log: EventLog, episode: stored.EpisodeRow | None) -> list[findings.StoppedEpisode]:
     """Return the parked and refused episodes."""
-    stopped: list[findings.StoppedEpisode] = []
-    for each in await log.stopped():
-        if episode is None or each.number == episode.number:
-            if each.refused is not None:
-                stopped.append(findings.StoppedEpisode(each.number, "refused", each.refused))
-            if each.parked is not None:
-                stopped.append(findings.StoppedEpisode(each.number, "parked", each.parked))
-    return stopped
+    rows = [each for each in await log.stopped() if episode is None or each.number == episode.number]
+    refused = [findings.StoppedEpisode(each.number, "refused", each.refused) for each in rows if each.refused]
+    return refused + [findings.StoppedEpisode(each.number, "parked", each.parked) for each in rows if each.parked]
 
 
 async def _check_heads(log: EventLog, within: findings.EpisodeRange, result: findings.VerifyResult) -> int:
@@ -624,7 +611,7 @@ class _TablesCheck:
             return
         if rows.episodes:
             fold.name_episodes(rows, await fold.uuids_of(connection, rows.episodes))
-        differences = await comparison.differences(connection, rows, self._part)
+        differences = await comparison.differences(connection, rows.to_insert(), self._part)
         if rows.descriptions:
             boxes = await fold.boxes_of(connection, rows.descriptions)
             differences += await comparison.box_differences(connection, boxes)
@@ -668,21 +655,15 @@ def check_of(projection: custom.Projection, result: findings.VerifyResult) -> fi
 
 async def uncompared_projections(log: EventLog, projections: Sequence[custom.Projection]) -> dict[str, str]:
     """Return the projections of this memory that cannot be compared, by name, with the reasons."""
-    by_name = {each.name: each for each in projections}
     async with log.snapshot() as connection:
         generations = table_generations.projections_in(await table_generations.read_generations(connection))
         dialect = connection.dialect
-    reasons: dict[str, str] = {}
-    for name, each in generations.items():
-        fault = "its code is not installed here"
-        if name in by_name:
-            fault = (
-                custom_tables.fault_in_version(by_name[name], each, custom_tables.layout_of(by_name[name], dialect))
-                or ""
-            )
-        if fault:
-            reasons[name] = fault
-    return reasons
+    reasons: dict[str, str | None] = dict.fromkeys(generations, "its code is not installed here")
+    for each in projections:
+        if (generation := generations.get(each.name)) is not None:
+            layout = custom_tables.layout_of(each, dialect)
+            reasons[each.name] = custom_tables.fault_in_version(each, generation, layout)
+    return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 class ProjectionCheck:
@@ -760,10 +741,14 @@ class ProjectionCheck:
             self.result.add_difference(each._replace(table=each.table.removeprefix(OWN)))
 
     async def differences(
-        self, connection: AsyncConnection, comparison: findings.Comparison, rows: Batch, episodes: findings.EpisodeRange
+        self,
+        connection: AsyncConnection,
+        comparison: findings.Comparison,
+        rows: fold.Batch,
+        episodes: findings.EpisodeRange,
     ) -> Sequence[findings.TableDifference]:
         """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
         assert isinstance(rows, custom.CustomRows)
-        differences = await comparison.differences(connection, rows, episodes)
+        differences = await comparison.differences(connection, rows.to_insert(), episodes)
         self.result.rows += comparison.count
         return differences

@@ -49,8 +49,8 @@ from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
 from pycrorm_async.projections.findings import Comparison, EpisodeRange, TableCheck, TableDifference, VerifyResult
+from pycrorm_async.projections.fold import Batch
 from pycrorm_async.projections.generations import select_generation
-from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import row_of
 from pycrorm_async.projections.verify import ProjectionCheck
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject

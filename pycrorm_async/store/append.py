@@ -37,7 +37,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DamageError, InternalError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1, SEQUENCE_MAX, EpisodeId, episode_text
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.events.types import REFERRING, Blob, BlobReference, references_in
 from pycrorm_async.store import schema
 from pycrorm_async.store import stored as storeds
@@ -420,12 +420,9 @@ class Appending:
             now_ns, numbers = SYSTEM_CLOCK.wall_ns(), [(number,) for number in restored.values()]
             await self._dialect.execute(connection, schema.UPDATE_RESTORED, now_ns=now_ns, numbers=numbers)
         assigned = restored | (await self._assign_numbers(connection, missing) if missing else {})
-        most = EPISODE_NUMBER_MAX
-        if max(assigned.values(), default=0) > EPISODE_NUMBER_MAX_0_1:
-            most = await self._dialect.number_max(connection)
         for each, number in assigned.items():
-            if number > most:
-                refusals[each] = f"all {most:,} episode numbers of this memory are used: {_room(most, _MOVE)}"
+            if number > EPISODE_NUMBER_MAX:
+                refusals[each] = f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used: {_MOVE}"
             else:
                 started_ns = self.episodes[each][0].wall_ns
                 rows[each] = storeds.EpisodeRow(
@@ -516,26 +513,20 @@ EVENTS_MANY = SEQUENCE_MAX * 9 // 10 + 1
 """Sequence from which an episode counts as nearly full: 60,397,977, nine tenths of the limit."""
 
 
-def number_warning(number: int, most: int = EPISODE_NUMBER_MAX) -> str | None:
-    """Return the warning for a memory's latest episode number, of at most `most`; None below nine tenths.
+def number_warning(number: int) -> str | None:
+    """Return the warning for a memory's latest episode number; None below nine tenths of the last.
 
     >>> number_warning(2_000_000_000)
     '2,000,000,000 of 2,147,483,647 episode numbers are used (93 %): record into a new database before none is left'
     """
+    most = EPISODE_NUMBER_MAX
     if number <= most * 9 // 10:
         return None
     if number >= most:
         kept = "new episodes are kept in the spool until it belongs to a new database"
-        return f"all {most:,} episode numbers are used: {_room(most, kept)}"
+        return f"all {most:,} episode numbers are used: {kept}"
     used = f"{number:,} of {most:,} episode numbers are used ({number * 100 // most} %)"
-    return f"{used}: {_room(most, 'record into a new database before none is left')}"
-
-
-def _room(most: int, advice: str) -> str:
-    """Return the advice for a memory without numbers; a login that owns the log gets more of one of version 0.1.0."""
-    if most == EPISODE_NUMBER_MAX:
-        return advice
-    return f"the login that owns the log makes room for {EPISODE_NUMBER_MAX:,} with `pycrorm writer --once`"
+    return f"{used}: record into a new database before none is left"
 
 
 def events_warning(episode: storeds.EpisodeRow) -> str | None:

@@ -18,7 +18,6 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EPISODE_NUMBER_MAX_0_1
 from pycrorm_async.store import schema
 from pycrorm_async.store.placement import PLAIN, Placement
 from pycrorm_async.store.stored import RemovedEpisode, Span, StoredEvent
@@ -256,15 +255,14 @@ class Dialect(ABC):
     async def table_state(self, connection: AsyncConnection, table: Table) -> TableState:
         """Return the state of a table of the log."""
 
-    async def number_max(self, connection: AsyncConnection, *, permit: bool = False) -> int:
-        """Return the highest number that an episode can get; `permit` first changes a log of version 0.1.0.
+    async def permit_all_numbers(self, connection: AsyncConnection) -> None:
+        """Let a log of version 0.1.0 have the numbers of this version, if the login owns it.
 
-        Programs of that version still use such a log, and refuse new episodes when they have used its numbers.
+        Programs of that version still use such a log, and refuse new episodes when they have used its former numbers.
         """
         is_former, is_owner = tuple((await connection.exec_driver_sql(self.has_former_numbers)).one())
-        if is_former and is_owner and permit:
+        if is_former and is_owner:
             await self.execute_all(connection, self.permit_numbers)
-        return EPISODE_NUMBER_MAX_0_1 if is_former and not (is_owner and permit) else EPISODE_NUMBER_MAX
 
     @abstractmethod
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:

@@ -348,15 +348,9 @@ class EventLog:
 
     async def limits_near(self) -> list[str]:
         """Return a warning for each limit of numbers that the memory, or an episode that has not ended, comes near."""
-        last = await self.last_number()
-        async with self.reading() as connection:
-            most = await self._dialect.number_max(connection)
         episodes = await self.read(storeds.EpisodeRow, schema.SELECT_LONG, events_min=appends.EVENTS_MANY)
-        return [
-            each
-            for each in (appends.number_warning(last, most), *map(appends.events_warning, episodes))
-            if each is not None
-        ]
+        warnings = (appends.number_warning(await self.last_number()), *map(appends.events_warning, episodes))
+        return [each for each in warnings if each is not None]
 
     async def declarations(self) -> list[bytes]:
         """Read the payloads of all DesignatorTypeDeclared, in the order of first arrival."""
@@ -474,7 +468,7 @@ async def _make_or_migrate(
         if (await dialect.table_state(connection, schema.DIGEST)).creatable:
             placed = await dialect.placement(connection)
             await dialect.execute_all(connection, dialect.definition(schema.DIGEST, placed, if_missing=True))
-        await dialect.number_max(connection, permit=True)
+        await dialect.permit_all_numbers(connection)
         format_now = len(dialect.migrations)
         if identity is None:
             identity = LogIdentity(str(uuid.uuid4()), format_now)

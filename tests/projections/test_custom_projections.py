@@ -28,6 +28,7 @@ from pycrorm_async.projections.custom_tables import states
 from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.fold import decode_events
 from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.projections.pipeline import Share
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
@@ -166,6 +167,17 @@ async def test_events_that_no_batch_of_the_tables_folded_are_looked_for_at_inter
         projector._custom._due_s = due_s
         while await projector.fold_next_batch():
             pass
+        assert await visible_rows(log) == rows
+
+
+async def test_the_share_of_a_process_without_the_code_is_folded_by_another(log: EventLog) -> None:
+    projector = await folded(log, declarations(PICK_UP), GraspRate())
+    await folded(log, mixed(tries(1), tries(2)))  # a process that folds the memory's own tables only
+    for help_s, rows in ((1e12, rows_of(2)), (0.0, [*rows_of(1), *rows_of(2)])):
+        projector._custom._help_s = help_s
+        projector._custom._due_s = 0.0
+        while await projector.fold_next_batch(Share(0, 2)):
+            projector._custom._due_s = 0.0
         assert await visible_rows(log) == rows
 
 
