@@ -5,10 +5,10 @@ Numbers are those of the table in tests/README.md; they follow the order in whic
 
 from __future__ import annotations
 
-import ast
 import asyncio
 import functools
 import operator
+import re
 import sys
 import tomllib
 from dataclasses import dataclass, field
@@ -17,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import grimp
 import pytest
 from sqlalchemy import select
 
@@ -256,29 +257,16 @@ def test_all_imports_are_declared_and_no_code_is_generated() -> None:
     ]
     names = {canonical(each) for each in declared}
     provided = metadata.packages_distributions()
-    for path in root.rglob("*.py"):
-        for imported in imports(ast.parse(path.read_text())):
-            if imported in sys.stdlib_module_names or imported in {"pycrorm_async", *OF_ROS}:
-                continue
-            distributions = provided.get(imported, [OTHERWISE_NAMED.get(imported, imported)])
-            assert names & {canonical(each) for each in distributions}, f"{path.name} imports {imported}"
+    graph = grimp.build_graph("pycrorm_async", include_external_packages=True, cache_dir=None)
+    for imported in {each for each in graph.modules if graph.is_module_squashed(each)}:
+        if imported in sys.stdlib_module_names or imported in OF_ROS:
+            continue
+        distributions = provided.get(imported, [OTHERWISE_NAMED.get(imported, imported)])
+        importers = graph.find_modules_that_directly_import(imported)
+        assert names & {canonical(each) for each in distributions}, f"{importers} import {imported}"
     assert not [path for path in root.rglob("*") if path.suffix in (".jinja", ".j2", ".tmpl")]
 
 
 def canonical(requirement: str) -> str:
     """Return the distribution's name in the form of the package index."""
-    name = requirement.split(";")[0]
-    for sign in "[<>=!~ ":
-        name = name.split(sign)[0]
-    return name.strip().lower().replace("_", "-")
-
-
-def imports(tree: ast.AST) -> set[str]:
-    """Return the top-level names of the imported modules."""
-    modules = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            modules |= {each.name.partition(".")[0] for each in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-            modules.add(node.module.partition(".")[0])
-    return modules
+    return re.split(r"[;\[<>=!~ ]", requirement)[0].lower().replace("_", "-")
