@@ -363,9 +363,10 @@ class Memory:
             unreported = self._unreported(fault)
             if unreported is not None:
                 raise unreported from fault
-        if parts.made_reading is not None and parts.made_reading.is_open:
-            await parts.made_reading.follow()
-            await parts.made_reading.refresh(maps=False)
+        reading: Reading | None = parts.made("reading")
+        if reading is not None and reading.is_open:
+            await reading.follow()
+            await reading.refresh(maps=False)
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
         """Return the fault less the parked episodes or outdated tables that a flush reported; None if that is all."""

@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeVar
 
 from pycrorm_async import connected_var, record
 from pycrorm_async import projections as folding
@@ -34,11 +34,29 @@ if TYPE_CHECKING:
     from pycrorm_async.recall import PickUpExperience, Recall
     from pycrorm_async.record import Recorder
 
+T = TypeVar("T")
+
 
 def built_in_declaration(dtype: str) -> DesignatorTypeDeclared | None:
     """Return the declaration of the plan layer's own type with this dtype; other names do not load the plan layer."""
     is_built_in = any(each.dtype == dtype for each in folding.SCHEMA.leaves)
     return record.built_in_declaration(dtype) if is_built_in else None
+
+
+class _part(Generic[T]):  # noqa: N801  used as a decorator
+    """A part that is made when it is first read, once, although several threads may read it."""
+
+    def __init__(self, make: Callable[[Any], T]) -> None:
+        self._make = make
+        self._name = make.__name__
+        self.__doc__ = make.__doc__
+
+    def __get__(self, parts: Parts, owner: type) -> T:
+        with parts.lock:
+            if self._name not in vars(parts):
+                vars(parts)[self._name] = self._make(parts)  # which is found before this descriptor from now on
+        part: T = vars(parts)[self._name]
+        return part
 
 
 class Parts:
@@ -64,43 +82,24 @@ class Parts:
         self.process = process
         self.emitter: Final[Emitter] = recording.emitter
         self.episodes: Final[OpenEpisodes] = recording.episodes
-        self.made_recorder: Recorder | None = None
-        self.made_reading: Reading | None = None
-        self._made_recall: Recall | None = None
-        self._made_experience: PickUpExperience | None = None
+        self.lock = threading.RLock()  # a finalizer may read a part while this thread makes one
         self._address = address
         self._replica = replica
         self._clock = clock
-        self._lock = threading.RLock()  # a finalizer may read a part while this thread makes one
 
-    @property
+    @_part
     def recorder(self) -> Recorder:
         """The recorder of our own plan layer."""
-        if self.made_recorder is None:
-            with self._lock:
-                if self.made_recorder is None:
-                    self.made_recorder = record.Recorder(self.recording)
-        return self.made_recorder
+        return record.Recorder(self.recording)
 
-    @property
+    @_part
     def reading(self) -> Reading:
         """The reading side, which opens the database at its first query."""
-        if self.made_reading is None:
-            with self._lock:
-                if self.made_reading is None:
-                    self.made_reading = reading_side.Reading(self._address, replica=self._replica, follows=True)
-        return self.made_reading
+        return reading_side.Reading(self._address, replica=self._replica, follows=True)
 
-    @property
+    @_part
     def recall(self) -> Recall:
         """The past actions of the database and of this process."""
-        if self._made_recall is None:
-            with self._lock:
-                if self._made_recall is None:
-                    self._made_recall = self._make_recall()
-        return self._made_recall
-
-    def _make_recall(self) -> Recall:
         running = recalling.ProcessCases(
             self.emitter,
             open_episodes=lambda: [*self.episodes.by_id],
@@ -111,15 +110,16 @@ class Parts:
         reader = recalling.CaseReader(recalling.DatabaseSource(self.reading), running)
         return recalling.Recall(reader, self.reading, self._clock)
 
-    @property
+    @_part
     def experience(self) -> PickUpExperience:
         """The experience that location designators ask."""
-        if self._made_experience is None:
-            with self._lock:
-                if self._made_experience is None:
-                    self._made_experience = recalling.PickUpExperience(self.reading, lambda: self.recall.reader)
-                    self._made_experience.is_closed = self.emitter.is_closed
-        return self._made_experience
+        experience = recalling.PickUpExperience(self.reading, lambda: self.recall.reader)
+        experience.is_closed = self.emitter.is_closed
+        return experience
+
+    def made(self, name: str) -> Any:
+        """Return the part of this name if it was used; None otherwise."""
+        return vars(self).get(name)
 
     async def flush(self) -> None:
         """Wait until all events recorded so far are stored and visible. Raises the errors of `Memory.flush`."""
@@ -129,7 +129,7 @@ class Parts:
 
     def close(self, error: BaseException | None) -> None:
         """End the open episodes and record nothing more."""
-        recorder = self.made_recorder
+        recorder: Recorder | None = self.made("recorder")
         self.episodes.refuse_new()
         for episode in self.episodes.all:
             (recorder.close_episode if recorder is not None else self.episodes.close)(
@@ -142,13 +142,13 @@ class Parts:
     def disconnect(self, *because: str) -> None:
         """Record nothing more, and answer no plan."""
         self.emitter.close(*because)
-        if self._made_experience is not None:
-            self._made_experience.is_closed = True
+        if (experience := self.made("experience")) is not None:
+            experience.is_closed = True
 
     async def close_reading(self) -> None:
         """Close the connections of the reading side, if it was used."""
-        if self.made_reading is not None:
-            await self.made_reading.close()
+        if (reading := self.made("reading")) is not None:
+            await reading.close()
 
     @contextmanager
     def in_context(self) -> Iterator[None]:
@@ -248,7 +248,7 @@ class MemoryStatus(NamedTuple):
     @classmethod
     def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:
         """Collect the present state of the memory with these parts."""
-        queue, emitter, recorder = parts.queue, parts.emitter, parts.made_recorder
+        queue, emitter, recorder = parts.queue, parts.emitter, parts.made("recorder")
         drain_status = queue.external_drain_status
         return cls(
             written=queue.written,
