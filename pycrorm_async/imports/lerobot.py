@@ -25,7 +25,7 @@ import numpy as np
 from pycrorm_async.errors import CallerError
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
-from pycrorm_async.imports.spans import NodeSpan, give_spans
+from pycrorm_async.imports.spans import NodeSpan, failure_in, give_spans, status_in
 from pycrorm_async.query.frames import needed_pyarrow
 
 _SECOND_NS = 10**9
@@ -132,7 +132,7 @@ class _DataSet:
             raise intakes.WrongFormat(f"{path} has the version {version:.20}, and 2.0, 2.1 and 3.0 can be read")
         self.identity = hashlib.sha256(content)
         self.plan = self._plan()
-        self.subtasks = self._names("subtask")
+        self.subtasks = self._subtask_names()
 
     def episodes(self) -> Iterator[_Row]:
         """Yield the episodes in their order."""
@@ -174,15 +174,7 @@ class _DataSet:
     def _raw_episodes(self) -> Iterator[Mapping[str, Any]]:
         meta = self.path / "meta"
         if not self.is_v3:
-            file = meta / "episodes.jsonl"
-            try:
-                for line in file.read_bytes().splitlines():
-                    if line.strip():
-                        yield msgspec.json.decode(line, type=dict[str, Any])
-            except OSError:
-                raise intakes.WrongFormat(f"{self.path} has no meta/episodes.jsonl") from None
-            except intakes.JSON_ERRORS as error:
-                raise intakes.WrongFormat(f"{file} has a line that is no JSON object: {error}") from None
+            yield from _lines(meta / "episodes.jsonl")
             return
         files = sorted((meta / "episodes").rglob("*.parquet"))
         if not files:
@@ -201,21 +193,11 @@ class _DataSet:
             nodes.setdefault(int(each["episode_index"]), []).append(each)
         return nodes
 
-    def _names(self, kind: str) -> dict[int, str]:
-        """Return the names of tasks or subtasks by their index."""
-        lines, table = self.path / "meta" / f"{kind}s.jsonl", self.path / "meta" / f"{kind}s.parquet"
-        rows: Sequence[Mapping[str, Any]] = ()
-        if table.exists():
-            rows = list(self._parquet(table, None))
-        elif lines.exists():
-            try:
-                content = lines.read_bytes().splitlines()
-                rows = [msgspec.json.decode(each, type=dict[str, Any]) for each in content if each]
-            except intakes.JSON_ERRORS as error:
-                raise intakes.WrongFormat(f"{lines} has a line that is no JSON object: {error}") from None
+    def _subtask_names(self) -> dict[int, str]:
+        lines, table = self.path / "meta" / "subtasks.jsonl", self.path / "meta" / "subtasks.parquet"
         names = {}
-        for each in rows:
-            index = each.get(f"{kind}_index")
+        for each in self._parquet(table, None) if table.exists() else _lines(lines) if lines.exists() else ():
+            index = each.get("subtask_index")
             if isinstance(index, int):
                 names[index] = next((value for value in each.values() if isinstance(value, str)), str(index))
         return names
@@ -231,6 +213,18 @@ class _DataSet:
                 yield from batch.to_pylist()
         except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
             raise intakes.WrongFormat(f"{file} cannot be read: {str(error).splitlines()[0]}") from None
+
+
+def _lines(file: Path) -> Iterator[Mapping[str, Any]]:
+    """Yield the objects of a file of JSON lines."""
+    try:
+        for line in file.read_bytes().splitlines():
+            if line.strip():
+                yield msgspec.json.decode(line, type=dict[str, Any])
+    except OSError:
+        raise intakes.WrongFormat(f"{file.parent.parent} has no meta/{file.name}") from None
+    except intakes.JSON_ERRORS as error:
+        raise intakes.WrongFormat(f"{file} has a line that is no JSON object: {error}") from None
 
 
 def _array(column: Any) -> np.ndarray[Any, Any]:
@@ -329,7 +323,6 @@ def _plan_spans(nodes: Sequence[Mapping[str, Any]], at: np.ndarray[Any, Any], en
     for each in nodes:
         if each["kind"] == "root":
             continue
-        failure = (str(each["reason"]), str(each["message"] or "")) if each.get("reason") else None
         begin = time_of(each["dataset_from_index"])
         spans.append(
             NodeSpan(
@@ -340,8 +333,8 @@ def _plan_spans(nodes: Sequence[Mapping[str, Any]], at: np.ndarray[Any, Any], en
                 max(begin, time_of(each["dataset_to_index"])),
                 parent=each["parent"],
                 kind=each["kind"],
-                status=each["status"],
-                failure=failure,
+                status=status_in(each["status"]),
+                failure=failure_in([each["reason"], each["message"] or ""]) if each["reason"] else None,
             )
         )
     return spans

@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 from msgspec.structs import replace
 
@@ -39,7 +39,7 @@ from pycrorm_async.export import neem_vocabulary as vocabulary
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
 from pycrorm_async.imports.neem_files import FileCut, NeemFiles, Transform, documents, neems_in, transforms, triples
-from pycrorm_async.imports.spans import NodeSpan, Other, give_spans
+from pycrorm_async.imports.spans import NodeSpan, Other, failure_in, give_spans, status_in
 from pycrorm_async.record.frames import FramePlaces
 from pycrorm_async.world.pose import ObjectType
 
@@ -422,10 +422,8 @@ class _NeemEpisode:
         span = NodeSpan(action, str(own["dtype"]), {}, own["start_ns"], own["end_ns"])
         span.parent = above if above in self._members else None
         span.kind = own["kind"]
-        span.status = own["status"] if own["status"] in get_args(NodeStatus) else "UNKNOWN"
-        span.status = "UNKNOWN" if span.status == "RUNNING" else span.status
-        failure = own.get("failure")
-        span.failure = (str(failure[0]), str(failure[1])) if failure else None
+        span.status = status_in(own["status"])
+        span.failure = failure_in(own.get("failure"))
         span.result = own.get("result")
         return span
 

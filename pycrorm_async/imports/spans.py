@@ -5,13 +5,15 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 from pycrorm_async.events.types import NodeStatus, RobotValue
 from pycrorm_async.imports.intake import IntakeEpisode
 
 END, OTHER, START, INSTANT, EMPTY_END = range(5)
 """The order at one time: a node ends before its successor starts, and one of no duration ends after its start."""
+
+_ENDS = frozenset(get_args(NodeStatus)) - {"RUNNING"}
 
 Other: TypeAlias = tuple[int, Callable[[int], object]]
 """A time in ns since 1970, and a function that gives something of that time to the episode."""
@@ -43,6 +45,16 @@ class NodeSpan:
     result: Any = None
     instants: Sequence[tuple[int, str, object]] = ()
     late: Callable[[NodeSpan, IntakeEpisode], tuple[Mapping[str, Any], RobotValue | None]] | None = None
+
+
+def status_in(value: Any) -> NodeStatus:
+    """Return the end of a node that an export of ours names; UNKNOWN for another value."""
+    return cast("NodeStatus", value) if isinstance(value, str) and value in _ENDS else "UNKNOWN"
+
+
+def failure_in(value: Any) -> tuple[str, str] | None:
+    """Return reason and message of a failure in an export of ours; None for another value."""
+    return (str(value[0]), str(value[1])) if isinstance(value, list) and len(value) == 2 else None
 
 
 def nest(spans: Iterable[NodeSpan]) -> None:

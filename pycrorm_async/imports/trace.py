@@ -28,15 +28,14 @@ from datetime import datetime
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 
-from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.export.traces import OWN
 from pycrorm_async.imports import intake as intakes
 from pycrorm_async.imports.intake import Intake, IntakeEpisode
-from pycrorm_async.imports.spans import NodeSpan, give_spans, nest
+from pycrorm_async.imports.spans import NodeSpan, failure_in, give_spans, nest, status_in
 
 _OWN = f"{OWN}."
 _NAMES_MAX, _NAME_MAX = 100, 200
@@ -49,7 +48,6 @@ _EPOCH_US = range(10**15, 10**16)
 """Times in µs that count from 1970: those of the years 2001 to 2286. Other clocks of traces begin near zero."""
 _GAP = re.compile(r"[\s,]*")
 _WHOLE = re.compile(r"-?[0-9]{1,19}")
-_STATUSES = frozenset(get_args(NodeStatus)) - {"RUNNING"}
 _INSTANTS = frozenset("iIRn")
 _Give: TypeAlias = Callable[[IntakeEpisode, int], None]
 _OTHERS = {
@@ -355,9 +353,7 @@ def _own_span(
     has_objects: bool = True,
 ) -> NodeSpan:
     """Return the node of an export of ours; where the file has no objects, their names take their places."""
-    kind, failure, parent = own.get("kind"), own.get("failure"), own.get("parent")
-    status = own.get("status")
-    known: Any = status if isinstance(status, str) and status in _STATUSES else "UNKNOWN"
+    kind, parent = own.get("kind"), own.get("parent")
     return NodeSpan(
         own["node"],
         str(own.get("dtype") or dtype),
@@ -366,8 +362,8 @@ def _own_span(
         end,
         parent=parent if isinstance(parent, int | str) else None,
         kind=kind if kind in ("motion", "language") else "action",
-        status=known,
-        failure=(str(failure[0]), str(failure[1])) if isinstance(failure, list) and len(failure) == 2 else None,
+        status=status_in(own.get("status")),
+        failure=failure_in(own.get("failure")),
         result=own.get("result"),
     )
 

@@ -16,9 +16,9 @@ import mcap.writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.imports import registry
 from pycrorm_async.imports.ros_messages import RosMap
-from tests.commands import one_line_of, pycrorm
 from tests.databases import ask
 from tests.imports.importing import imported, poses, tree
 
@@ -217,10 +217,8 @@ def test_an_mcap_file_that_is_cut_anywhere_gives_what_stands_before_and_says_whe
     content = in_small_chunks(file, tmp_path / "small.mcap")
     changes: list[int] = []
     for tenths in (0, 2, 4, 6):
-        folder = tmp_path / f"cut{tenths}"
-        folder.mkdir()
-        (folder / "bag.mcap").write_bytes(content[: 40 + len(content) * tenths // 10])
-        report = imported(folder, "mcap", folder / "bag.mcap")
+        (tmp_path / "bag.mcap").write_bytes(content[: 40 + len(content) * tenths // 10])
+        report = registry.import_files("mcap", [tmp_path / "bag.mcap"], None)
         [line] = report.cut
         assert "bag.mcap cannot be read behind byte" in line
         changes.append(sum(each.changes for each in report.episodes))
@@ -356,6 +354,6 @@ def test_images_come_at_their_rate_as_blobs(tmp_path: Path) -> None:
 )
 def test_another_file_is_one_line(tmp_path: Path, make: Callable[[Path], object], line: str) -> None:
     make(tmp_path / "x.bag")
-    done = pycrorm("import", "rosbag2", "x.bag", "--dry-run", cwd=tmp_path)
-    assert done.returncode == 2
-    assert line in one_line_of(done)
+    with pytest.raises(CallerError, match=re.escape(line)) as refused:
+        registry.import_files("rosbag2", [tmp_path / "x.bag"], None)
+    assert "\n" not in str(refused.value)

@@ -12,6 +12,7 @@ import re
 import signal
 import subprocess
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,105 +21,111 @@ import pytest
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import PoseValue
-from pycrorm_async.imports.intake import TYPES_MAX
+from pycrorm_async.imports import intake
 from pycrorm_async.imports.registry import import_files
+from pycrorm_async.memory import SyncMemory
 from pycrorm_async.world.pose import Pose
-from tests.commands import COMMAND, environment, one_line_of, pycrorm
-from tests.databases import ask
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.databases import ask, put_memory
 from tests.imports.importing import imported, poses, tree
+from tests.record.recordings import AT_END, assert_verified
 
 AT = 1_700_000_000_000_000_000
 MS = 1_000_000
 
 
-def recorded_walk(url: str) -> None:
+def record_walk(memory: SyncMemory) -> None:
     """Record an episode with every status, overlapping branches, two objects, results and observations."""
-    with Memory.sync(url) as memory:
-        drive = memory.recording.type("action", "NavigateAction", {"target_location": "pose", "speed": "real"})
-        pick = memory.recording.type("action", "PickUpAction", {"object_designator": "object", "arm": "enum"})
-        both = memory.recording.type("language", "Parallel")
-        with memory.recording.episode(description="a walk", id="walk", at=AT) as episode:
-            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]), {"wheel": 0.5}, at=AT + 1)
-            episode.object_added("m", "milk", "MILK", Pose([1, 2, 0.5], [0, 0, 1, 0]), at=AT + 2)
-            episode.start("both", both, at=AT + MS, robot="base")
-            episode.start(
-                "a", drive, {"target_location": Pose([1, 0.25, 0]), "speed": 0.5}, parent="both", at=AT + 2 * MS
-            )
-            episode.start("b", pick, {"object_designator": "m", "arm": "LEFT"}, parent="both", at=AT + 3 * MS)
-            episode.object_moved("base", PoseValue((0.1, 0.2, 0.3), (0, 0, 0, 1), "map", 0), node="a", at=AT + 4 * MS)
-            episode.joints_moved("base", {"wheel": 1.25}, at=AT + 4 * MS + 1)
-            episode.observe("slip", {"left": 0.8, "words": ["a", "b"]}, node="a", at=AT + 5 * MS)
-            episode.end("a", "FAILED", ("WheelSlipped", "the left one"), at=AT + 6 * MS)
-            episode.end("b", "SUCCEEDED", result={"grip_n": 5.5}, at=AT + 7 * MS)
-            for key, status in enumerate(("ERROR", "CANCELLED", "INTERRUPTED", "UNKNOWN")):
-                episode.start(key, drive, {"speed": float(key)}, parent="both", at=AT + (8 + key) * MS)
-                episode.end(key, status, at=AT + (8 + key) * MS)  # type: ignore[arg-type]
-            episode.object_removed("m", at=AT + 20 * MS)
-            episode.end("both", "FAILED", ("ChildFailed", ""), at=AT + 21 * MS)
-            episode.close(status="FAILED", at=AT + 22 * MS)
-        memory.flush()
+    drive = memory.recording.type("action", "NavigateAction", {"target_location": "pose", "speed": "real"})
+    pick = memory.recording.type("action", "PickUpAction", {"object_designator": "object", "arm": "enum"})
+    both = memory.recording.type("language", "Parallel")
+    with memory.recording.episode(description="a walk", id="walk", at=AT) as episode:
+        episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]), {"wheel": 0.5}, at=AT + 1)
+        episode.object_added("m", "milk", "MILK", Pose([1, 2, 0.5], [0, 0, 1, 0]), at=AT + 2)
+        episode.start("both", both, at=AT + MS, robot="base")
+        goal = {"target_location": Pose([1, 0.25, 0]), "speed": 0.5}
+        episode.start("a", drive, goal, parent="both", at=AT + 2 * MS)
+        episode.start("b", pick, {"object_designator": "m", "arm": "LEFT"}, parent="both", at=AT + 3 * MS)
+        episode.object_moved("base", PoseValue((0.1, 0.2, 0.3), (0, 0, 0, 1), "map", 0), node="a", at=AT + 4 * MS)
+        episode.joints_moved("base", {"wheel": 1.25}, at=AT + 4 * MS + 1)
+        episode.observe("slip", {"left": 0.8, "words": ["a", "b"]}, node="a", at=AT + 5 * MS)
+        episode.end("a", "FAILED", ("WheelSlipped", "the left one"), at=AT + 6 * MS)
+        episode.end("b", "SUCCEEDED", result={"grip_n": 5.5}, at=AT + 7 * MS)
+        for key, status in enumerate(("ERROR", "CANCELLED", "INTERRUPTED", "UNKNOWN")):
+            episode.start(key, drive, {"speed": float(key)}, parent="both", at=AT + (8 + key) * MS)
+            episode.end(key, status, at=AT + (8 + key) * MS)  # type: ignore[arg-type]
+        episode.object_removed("m", at=AT + 20 * MS)
+        episode.end("both", "FAILED", ("ChildFailed", ""), at=AT + 21 * MS)
+        episode.close(status="FAILED", at=AT + 22 * MS)
 
 
-@pytest.mark.parametrize("file_format", ["trace", "otlp"])
-def test_an_import_of_our_own_export_has_the_same_tree_statuses_times_and_poses(
-    tmp_path: Path, file_format: str
-) -> None:
-    source = tmp_path / "source.db"
-    recorded_walk(f"sqlite:///{source}")
-    file = tmp_path / "walk.json"
-    done = pycrorm("export", "1", "--format", file_format, "--out", file, "--url", f"sqlite:///{source}", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    if file_format == "otlp":  # it has no objects, so that the field of the object keeps a name, of another type
-        content = file.read_text().replace('"object_designator"', '"object_name"')
-        file.write_text(content)
-    report = imported(tmp_path, "trace", file)
-    before, after = tree(source), tree(tmp_path / "memory.db")
-    assert len(before) == 7
-    assert after == before
-    assert [each.statuses.total() for each in report.episodes] == [7]
-    assert not report.left_out
-    if file_format == "trace":
-        assert poses(tmp_path / "memory.db") == poses(source)
-        assert len(poses(source)) == 3
-    for kind, field in (("Observed", "values"), ("NodeEnded", "result"), ("EpisodeEnded", "status")):
-        query = f"SELECT json_extract(payload, '$.{field}') FROM event WHERE type = '{kind}'"
-        assert ask(tmp_path / "memory.db", query) == ask(source, query)
-
-
-def recorded_values(url: str) -> None:
+def record_numbers(memory: SyncMemory) -> None:
     """Record whole numbers that no real number has, a value that is missing, and observations of the root."""
-    with Memory.sync(url) as memory:
-        given = {"i": int, "n": int, "r": float, "many": list[int], "by_name": dict[str, int]}
-        count = memory.recording.type("action", "Count", given)
-        with memory.recording.episode(description="count", id="count", at=AT, tags=["a,b", "night"]) as episode:
-            episode.observe("begun", {"load": -3}, at=AT + 1)
-            for key, (number, real) in enumerate(((2**53 + 1, 0.5), (-(2**63), math.nan), (2**62 + 1, -0.0))):
-                values = {"i": number, "n": -5, "r": real, "many": [number, 1], "by_name": {"a": number}}
-                episode.start(key, count, values, at=AT + 10 * (key + 1))
-                episode.end(key, "SUCCEEDED", at=AT + 10 * (key + 1) + 5)
-            episode.observe("ended", "ok", at=AT + 99)
-            episode.close(at=AT + 100)
+    given = {"i": int, "n": int, "r": float, "many": list[int], "by_name": dict[str, int]}
+    count = memory.recording.type("action", "Count", given)
+    with memory.recording.episode(description="count", id="count", at=AT, tags=["a,b", "night"]) as episode:
+        episode.observe("begun", {"load": -3}, at=AT + 1)
+        for key, (number, real) in enumerate(((2**53 + 1, 0.5), (-(2**63), math.nan), (2**62 + 1, -0.0))):
+            values = {"i": number, "n": -5, "r": real, "many": [number, 1], "by_name": {"a": number}}
+            episode.start(key, count, values, at=AT + 10 * (key + 1))
+            episode.end(key, "SUCCEEDED", at=AT + 10 * (key + 1) + 5)
+        episode.observe("ended", "ok", at=AT + 99)
+        episode.close(at=AT + 100)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a memory of a walk and of numbers, and the exports of both, such as `walk.otlp`."""
+    folder = tmp_path_factory.mktemp("source")
+    with Memory.sync(put_memory(folder / "memory.db")) as memory:
+        record_walk(memory)
+        record_numbers(memory)
         memory.flush()
+        for (number, name), kind in product(enumerate(("walk", "numbers"), 1), ("trace", "otlp")):
+            memory.export(number, folder / f"{name}.{kind}", file_format=kind)
+    return folder
 
 
-@pytest.mark.parametrize("file_format", ["trace", "otlp"])
-def test_whole_numbers_keep_each_digit_and_what_was_missing_stays_so(tmp_path: Path, file_format: str) -> None:
-    source = tmp_path / "source.db"
-    recorded_values(f"sqlite:///{source}")
-    file = tmp_path / "count.json"
-    done = pycrorm("export", "1", "--format", file_format, "--out", file, "--url", f"sqlite:///{source}", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = imported(tmp_path, "trace", file)
+@pytest.fixture(scope="module", params=["trace", "otlp"])
+def again(request: pytest.FixtureRequest, source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """Return a format, and the memory that imported the exports of it."""
+    folder = tmp_path_factory.mktemp("again")
+    walk, numbers = source / f"walk.{request.param}", source / f"numbers.{request.param}"
+    if request.param == "otlp":  # it has no objects, so that the field of the object keeps a name, of another type
+        walk = folder / "walk.otlp"
+        walk.write_text((source / "walk.otlp").read_text().replace('"object_designator"', '"object_name"'))
+    report = imported(folder, "trace", walk, numbers)
+    assert [each.statuses.total() for each in report.episodes] == [7, 3]
     assert list(report.left_out.items()) == [(("values", "the memory that wrote the file could not record them"), 1)]
-    stored = ask(tmp_path / "memory.db", "SELECT payload FROM event WHERE type = 'NodeStarted' ORDER BY sequence")
+    return request.param, folder / "memory.db"
+
+
+def test_an_import_of_our_own_export_has_the_same_tree_statuses_times_and_poses(
+    source: Path, again: tuple[str, Path]
+) -> None:
+    file_format, after = again
+    before = source / "memory.db"
+    assert len(tree(before)) == 7
+    assert tree(after) == tree(before)
+    if file_format == "trace":
+        assert poses(after) == poses(before)
+        assert len(poses(before)) == 3
+    for kind, field in (("Observed", "values"), ("NodeEnded", "result"), ("EpisodeEnded", "status")):
+        query = f"SELECT json_extract(payload, '$.{field}') FROM event WHERE type = '{kind}' AND episode = 1"
+        assert ask(after, query) == ask(before, query)
+
+
+def test_whole_numbers_keep_each_digit_and_what_was_missing_stays_so(again: tuple[str, Path]) -> None:
+    _, file = again
+    stored = ask(file, "SELECT payload FROM event WHERE type = 'NodeStarted' AND episode = 2 ORDER BY sequence")
     first, second, third = (json.loads(payload)["parameters"] for (payload,) in stored[1:])
     big, least = 2**53 + 1, -(2**63)
     assert first == {"i": big, "n": -5.0, "r": 0.5, "many": [big, 1], "by_name": {"a": big}}
     assert second == {"i": least, "n": -5.0, "many": [least, 1], "by_name": {"a": least}}
     assert (third["i"], math.copysign(1, third["r"])) == (2**62 + 1, -1.0)
-    assert ask(tmp_path / "memory.db", "SELECT tag FROM episode_tag ORDER BY tag") == [("a,b",), ("night",)]
-    observed = "SELECT json_extract(payload, '$.name'), wall_ns FROM event WHERE type = 'Observed' ORDER BY sequence"
-    assert ask(tmp_path / "memory.db", observed) == [("begun", AT + 1), ("ended", AT + 99)]
+    assert ask(file, "SELECT tag FROM episode_tag ORDER BY tag") == [("a,b",), ("night",)]
+    observed = "SELECT json_extract(payload, '$.name'), wall_ns FROM event WHERE type = 'Observed' AND episode = 2"
+    assert ask(file, f"{observed} ORDER BY sequence") == [("begun", AT + 1), ("ended", AT + 99)]
 
 
 def trace_of(*events: dict[str, Any]) -> str:
@@ -207,7 +214,7 @@ def test_spans_of_opentelemetry_become_one_episode_for_each_trace(tmp_path: Path
 def test_a_list_without_its_last_bracket_is_whole_and_one_cut_inside_an_event_is_not(tmp_path: Path, rest: str) -> None:
     event = json.dumps({"ph": "X", "name": "Drive", "ts": 0, "dur": 5, "pid": 1, "tid": 1})
     (tmp_path / "t.json").write_text(f"[{event},{event}{rest}")
-    report = imported(tmp_path, "trace", tmp_path / "t.json")
+    report = import_files("trace", [tmp_path / "t.json"], None)
     assert [each.nodes for each in report.episodes] == [2]
     assert len(report.cut) == rest.count("{")
 
@@ -216,7 +223,7 @@ def test_a_compressed_trace_that_is_cut_is_imported_as_far_as_it_can_be_read(tmp
     events = [{"ph": "X", "name": f"Drive {each}", "ts": each, "dur": 1, "pid": 1, "tid": 1} for each in range(500)]
     whole = gzip.compress(json.dumps(events).encode())
     (tmp_path / "t.json.gz").write_bytes(whole[: len(whole) // 2])
-    report = imported(tmp_path, "trace", tmp_path / "t.json.gz")
+    report = import_files("trace", [tmp_path / "t.json.gz"], None)
     assert 100 < sum(each.nodes for each in report.episodes) < 500
     [cut] = report.cut
     assert "at the end of what can be decompressed; what stands before is imported" in cut
@@ -235,11 +242,10 @@ def _changed(value: Any, randomness: random.Random) -> Any:
 
 
 @pytest.mark.parametrize("file_format", ["trace", "otlp"])
-def test_a_document_with_any_other_values_is_refused_in_one_line_or_imported(tmp_path: Path, file_format: str) -> None:
-    source = f"sqlite:///{tmp_path}/source.db"
-    recorded_walk(source)
-    pycrorm("export", "1", "--format", file_format, "--out", tmp_path / "walk.json", "--url", source, cwd=tmp_path)
-    document = json.loads((tmp_path / "walk.json").read_text())
+def test_a_document_with_any_other_values_is_refused_in_one_line_or_imported(
+    source: Path, tmp_path: Path, file_format: str
+) -> None:
+    document = json.loads((source / f"walk.{file_format}").read_text())
     randomness, read = random.Random(1), 0
     paths = [tmp_path / f"{number}.json" for number in range(100)]
     for path in paths:
@@ -247,16 +253,18 @@ def test_a_document_with_any_other_values_is_refused_in_one_line_or_imported(tmp
         with contextlib.suppress(CallerError):
             read += len(import_files("trace", [path], None).episodes)
     assert read > 30
-    with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
+    with Memory.sync(put_memory(tmp_path / "memory.db"), settings=AT_END) as memory:
         for path in paths[:20]:
             with contextlib.suppress(CallerError):
                 import_files("trace", [path], memory.recording)
         memory.flush()
-    done = pycrorm("verify", "--url", f"sqlite:///{tmp_path}/memory.db", cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert_verified(tmp_path)
 
 
-def test_hostile_names_and_thousands_of_them_make_few_types_and_no_faults(tmp_path: Path) -> None:
+def test_hostile_names_and_thousands_of_them_make_few_types_and_no_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(intake, "TYPES_MAX", 20)  # each has a table, which takes time
     names = [
         "'; DROP TABLE event; --",
         "\x1b[2J",
@@ -265,7 +273,7 @@ def test_hostile_names_and_thousands_of_them_make_few_types_and_no_faults(tmp_pa
         "",
         "select",
         "a" * 500,
-        *map("n{}".format, range(300)),
+        *map("n{}".format, range(30)),
     ]
     arguments = {"; x": 1, "kind": "k", "a.b": "c", "a b": "d", **{f"f{n}": n for n in range(100)}}
     events = [
@@ -276,10 +284,9 @@ def test_hostile_names_and_thousands_of_them_make_few_types_and_no_faults(tmp_pa
     report = imported(tmp_path, "trace", tmp_path / "t.json")
     dtypes = {row[0] for row in tree(tmp_path / "memory.db")}
     assert report.episodes[0].nodes == len(names)
-    assert len(dtypes) == TYPES_MAX
+    assert len(dtypes) == 20
     assert ask(tmp_path / "memory.db", "SELECT count(*) FROM task_tree_node") == [(len(names) + 1,)]
-    done = pycrorm("verify", "--url", f"sqlite:///{tmp_path}/memory.db", cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert_verified(tmp_path)
 
 
 def test_the_same_file_twice_is_stored_once_and_another_name_in_the_map_stores_it_again(tmp_path: Path) -> None:
@@ -343,11 +350,14 @@ def test_a_wrong_call_or_file_is_one_line(tmp_path: Path, words: list[str], line
     assert "\n" not in str(refused.value)
 
 
-def test_the_command_refuses_a_file_in_one_line_and_stores_nothing(tmp_path: Path) -> None:
+def test_the_command_counts_the_statuses_or_refuses_the_file_in_one_line_and_stores_nothing(tmp_path: Path) -> None:
+    url = "--url", put_memory(tmp_path / "memory.db")
+    (tmp_path / "t.json").write_text(trace_of({"ph": "X", "name": "Drive", "ts": 0, "dur": 5}))
+    announced = answer("import", "trace", "t.json", "--dry-run", *url, cwd=tmp_path)
+    assert [each["statuses"] for each in announced["episodes"]] == [{"UNKNOWN": 1}]
     (tmp_path / "words.txt").write_text("no trace at all")
-    for option in ([], ["--dry-run"]):
-        done = pycrorm("import", "trace", "words.txt", *option, "--url", "sqlite:///memory.db", cwd=tmp_path)
-        assert (done.returncode, "words.txt is no trace in JSON" in one_line_of(done)) == (2, True)
+    done = pycrorm("import", "trace", "words.txt", *url, cwd=tmp_path)
+    assert (done.returncode, "words.txt is no trace in JSON" in one_line_of(done)) == (2, True)
     assert ask(tmp_path / "memory.db", "SELECT count(*) FROM event") == [(0,)]
 
 
@@ -360,9 +370,3 @@ def test_a_trace_with_values_that_only_python_writes_is_whole(tmp_path: Path) ->
     assert [each.nodes for each in report.episodes] == [3]
     times = ask(tmp_path / "memory.db", "SELECT wall_ns FROM event WHERE type = 'NodeEnded' ORDER BY sequence")
     assert [ns for (ns,) in times] == [0, 1000, 2000, 2000]  # that of the root is the last
-
-
-def test_the_json_of_a_report_counts_the_statuses(tmp_path: Path) -> None:
-    (tmp_path / "t.json").write_text(trace_of({"ph": "X", "name": "Drive", "ts": 0, "dur": 5}))
-    done = pycrorm("import", "trace", "t.json", "--json", "--dry-run", "--url", "sqlite:///memory.db", cwd=tmp_path)
-    assert [each["statuses"] for each in json.loads(done.stdout)["episodes"]] == [{"UNKNOWN": 1}]
