@@ -5,11 +5,10 @@ Panel: Hand over, 1.
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -17,7 +16,7 @@ from pycrorm_async.cli import output
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.export import ExportComparison, Exported, export_again, format_named, format_of
+from pycrorm_async.export.export import Exported, export_again, format_named, format_of
 from pycrorm_async.export.export import export as write_export
 from pycrorm_async.export.selection import read_manifest
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
@@ -27,6 +26,7 @@ from pycrorm_async.query.questions import QUESTIONS, arguments_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import shared_address
 
+T = TypeVar("T")
 _READ: Mapping[Any, Callable[[str], Any]] = {
     bool: lambda text: {"true": True, "false": False}[text.lower()],
     int: int,
@@ -115,30 +115,30 @@ def export(
     options["images"] = images if images in (None, "none") else output.parse_size("--images", images)
     options["arguments"] = _arguments(what[0], arguments or []) if what else {}
 
-    async def write(report_progress: ProgressCallback | None) -> Exported:
-        async with Reading.open(place.url, read_url=place.read_url) as reading:
-            chosen = episode or []
-            if choice != EpisodeChoice():
-                chosen = [str(each.number) for each in await reading.episodes(choice) if each.status != "RUNNING"]
-                if not chosen:
-                    raise CallerError(f"{await absence_of_episodes(reading, choice)}: nothing is exported")
-            named, limited = (what, chosen) if what else (chosen, [])
-            return await write_export(
-                reading, named, out, episodes=limited, force=force, report_progress=report_progress, **options
-            )
+    async def write(reading: Reading, report: ProgressCallback | None) -> Exported:
+        chosen = episode or []
+        if choice != EpisodeChoice():
+            chosen = [str(each.number) for each in await reading.episodes(choice) if each.status != "RUNNING"]
+            if not chosen:
+                raise CallerError(f"{await absence_of_episodes(reading, choice)}: nothing is exported")
+        named, limited = (what, chosen) if what else (chosen, [])
+        return await write_export(reading, named, out, episodes=limited, force=force, report_progress=report, **options)
 
-    interrupt_on_termination()
-    with progress_bar("exporting", unit=_unit(file_format or format_of(out))) as report_progress:
-        exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
-    place.place.note_pending_events()
+    exported = _shown(place, file_format or format_of(out), write)
     _print(exported, as_json=as_json)
     for number, reason in exported.unreadable.items():
         output.problem(f"episode {number} is not in it: {reason}")
     return 1 if exported.unreadable else 0
 
 
-def _unit(file_format: str) -> str:
-    return "rows" if format_named(file_format).holds == "rows" else "events"
+def _shown(
+    place: ReadingPlace, file_format: str, write: Callable[[Reading, ProgressCallback | None], Awaitable[T]]
+) -> T:
+    """Return the result of an export, which SIGTERM interrupts and whose progress is shown on a terminal."""
+    interrupt_on_termination()
+    unit = "rows" if format_named(file_format).holds == "rows" else "events"
+    with progress_bar("exporting", unit=unit) as report_progress:
+        return place.read(lambda reading: write(reading, report_progress if stderr.is_terminal else None))
 
 
 def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
@@ -160,14 +160,11 @@ def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
 
 
 def _again(manifest: Path, out: Path | None, place: ReadingPlace, *, force: bool, as_json: bool) -> int:
-    async def write(report_progress: ProgressCallback | None) -> ExportComparison:
-        async with Reading.open(place.url, read_url=place.read_url) as reading:
-            return await export_again(reading, manifest, out, force=force, report_progress=report_progress)
-
-    interrupt_on_termination()
-    with progress_bar("exporting", unit=_unit(read_manifest(manifest).file_format)) as report_progress:
-        comparison = asyncio.run(write(report_progress if stderr.is_terminal else None))
-    place.place.note_pending_events()
+    comparison = _shown(
+        place,
+        read_manifest(manifest).file_format,
+        lambda reading, report: export_again(reading, manifest, out, force=force, report_progress=report),
+    )
     if as_json:
         file = comparison.exported and out
         outcome = {"same": comparison.same, "by_bytes": comparison.by_bytes, "differences": comparison.differences}

@@ -16,8 +16,9 @@ from pycrorm_async.cli import output
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.export.formats import format_names
 from pycrorm_async.imports.intake import ImportReport
-from pycrorm_async.imports.registry import BUILT_IN, format_names, import_files
+from pycrorm_async.imports.registry import BUILT_IN, GROUP, import_files
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.reading import Reading
@@ -35,7 +36,9 @@ def import_(
     file_format: Annotated[
         str,
         typer.Argument(
-            metavar="FORMAT", help=f"The format of the files: {', '.join(BUILT_IN)}.", autocompletion=format_names
+            metavar="FORMAT",
+            help=f"The format of the files: {', '.join(BUILT_IN)}.",
+            autocompletion=lambda: format_names(GROUP, BUILT_IN),
         ),
     ],
     paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="The files or folders to import.")],

@@ -19,7 +19,6 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from importlib.metadata import entry_points
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -31,7 +30,7 @@ from sqlalchemy import inspect as inspect_database
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export import selection as selections
-from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written
+from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written, format_names, offered_format
 from pycrorm_async.export.lerobot import LEROBOT
 from pycrorm_async.export.lerobot_images import ExportedImages, check_size
 from pycrorm_async.export.neem import NEEM
@@ -43,7 +42,6 @@ from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.query.question import Question
 from pycrorm_async.query.questions import QUESTIONS, Ask, arguments_of
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.text import nearest
 from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
 
 if TYPE_CHECKING:
@@ -116,14 +114,9 @@ class ExportComparison(NamedTuple):
     by_bytes: bool = True
 
 
-def format_names() -> list[str]:
-    """Return the names of the built-in formats, and of those that installed packages offer."""
-    return [*FORMATS, *sorted({each.name for each in entry_points(group=GROUP)} - FORMATS.keys())]
-
-
 def format_of(path: Path) -> FileFormat:
     """Return the format that the suffix of a file names. Raises `CallerError`."""
-    suffix, names = path.suffix.removeprefix(".").lower(), format_names()
+    suffix, names = path.suffix.removeprefix(".").lower(), format_names(GROUP, FORMATS)
     if suffix not in names or format_named(suffix).marker:
         listed = ", ".join(names)
         raise CallerError(f"the suffix of {path} names no format: add --format (file_format=), one of {listed}")
@@ -132,14 +125,8 @@ def format_of(path: Path) -> FileFormat:
 
 def format_named(name: str) -> Format:
     """Return the format of this name. Raises `CallerError`."""
-    names = format_names()
-    if name not in names:
-        raise CallerError(f"there is no format {name!r}{nearest(name, names)}; formats: {', '.join(names)}")
-    if name in FORMATS:
-        return FORMATS[name]
-    [offered, *_] = entry_points(group=GROUP, name=name)
-    loaded: Format = offered.load()
-    return loaded
+    named: Format = FORMATS.get(name) or offered_format(GROUP, FORMATS, name)
+    return named
 
 
 async def export(
@@ -201,6 +188,9 @@ async def export(
         )
         if not is_of_rows and selection.kind != "episodes":
             raise CallerError(f"{whole}, and {selection.name} is a {selection.kind}")
+        if chosen.holds == "episode" and len(selection.episodes) != 1:
+            count = len(selection.episodes)
+            raise CallerError(f"a file of the format {name} holds one episode, got {count}: name one")
         job = Job(reading, name, selection, options, report_progress)
         folder = new_folder(target, force=force, marker=chosen.marker) if chosen.marker else None
         with folder or new_file(target, force=force) as unnamed:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import asyncio
 from base64 import b64encode
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, aclosing, contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
@@ -20,9 +21,11 @@ import msgspec
 from sqlalchemy import Select, func, select
 from sqlalchemy.exc import CompileError
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.export.selection import Selection
 from pycrorm_async.query.frames import columns_of, needed_pyarrow
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.text import nearest
 from pycrorm_async.visible_text import without_formula
 from pycrorm_async.writer.drain import run_to_completion
 
@@ -106,6 +109,19 @@ class Format(NamedTuple):
     marker: str = ""
     same_bytes: bool = True
     beside: str = ""
+
+
+def format_names(group: str, built_in: Iterable[str]) -> list[str]:
+    """Return the names of the built-in formats, and of those that installed packages offer in a group."""
+    return [*built_in, *sorted({each.name for each in entry_points(group=group)} - {*built_in})]
+
+
+def offered_format(group: str, built_in: Iterable[str], name: str) -> Any:
+    """Load the format of this name that an installed package offers in a group. Raises `CallerError`."""
+    for each in entry_points(group=group, name=name):
+        return each.load()
+    names = format_names(group, built_in)
+    raise CallerError(f"there is no format {name!r}{nearest(name, names)}; formats: {', '.join(names)}")
 
 
 # === row files ================================================================================================

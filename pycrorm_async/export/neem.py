@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 from urllib.parse import quote
 
-from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.errors import MissingExtra
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
 from pycrorm_async.export import neem_vocabulary as vocabulary
@@ -230,10 +230,8 @@ def _document(s: str, p: str, o: Any) -> dict[str, Any]:
 
 
 async def write_neem(job: Job, folder: Path) -> Written:
-    """Write one episode. Raises `CallerError` for several, and `MissingExtra`."""
+    """Write one episode. Raises `MissingExtra`."""
     encode = needed_bson()
-    if len(job.selection.episodes) != 1:
-        raise CallerError(f"a NEEM holds one episode, got {len(job.selection.episodes)}: name one")
     [covered] = job.selection.episodes
     episode = await read_episode(NeemEpisode, job.reading, covered, job.reporter("reading"))
     moves = [*episode.moves, *[each async for each in _streamed(episode, job.reading)]]

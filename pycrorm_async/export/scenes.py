@@ -750,13 +750,7 @@ _WriteScene: TypeAlias = Callable[
 
 
 async def write_scene(write: _WriteScene, job: Job, path: Path, *, triangles_max: int = 0) -> Written:
-    """Write one episode to a file, with at most so many triangles of meshes.
-
-    Raises `CallerError` for several, and `MissingExtra`.
-    """
-    if len(job.selection.episodes) != 1:
-        count = len(job.selection.episodes)
-        raise CallerError(f"a file of the format {job.file_format} holds one episode, got {count}: name one")
+    """Write one episode to a file, with at most so many triangles of meshes. Raises `MissingExtra`."""
     [covered] = job.selection.episodes
     episode = await read_episode(ExportedEpisode, job.reading, covered, job.reporter("reading"))
     objects = await scene_objects(job.reading, episode, triangles_max)

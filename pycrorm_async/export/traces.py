@@ -14,12 +14,12 @@ What the formats have no place for is below the key `pycrorm`, so that an import
 
 import asyncio
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
-from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import Happening, NodeEnded, ObjectMoved, Observed
 from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.scenes import ExportedEpisode, read_episode
@@ -279,15 +279,5 @@ async def _write(document_of: Callable[[TracedEpisode], dict[str, Any]], job: Jo
     return Written(rows)
 
 
-async def _write_trace(job: Job, path: Path) -> Written:
-    if len(job.selection.episodes) != 1:
-        raise CallerError(f"a trace holds one episode, got {len(job.selection.episodes)}: name one, or use otlp")
-    return await _write(trace_document, job, path)
-
-
-async def _write_otlp(job: Job, path: Path) -> Written:
-    return await _write(otlp_document, job, path)
-
-
-TRACE = Format(_write_trace, noun="node", holds="episode", packages=())
-OTLP = Format(_write_otlp, noun="node", holds="episodes", packages=())
+TRACE = Format(partial(_write, trace_document), noun="node", holds="episode", packages=())
+OTLP = Format(partial(_write, otlp_document), noun="node", holds="episodes", packages=())

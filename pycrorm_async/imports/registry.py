@@ -10,7 +10,6 @@ whose value is an `ImportFormat`.
 
 from collections.abc import Container, Iterable, Sequence
 from importlib import import_module
-from importlib.metadata import entry_points
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -18,9 +17,9 @@ from typing import Final
 import msgspec
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.export.formats import offered_format
 from pycrorm_async.imports.intake import ImportFormat, ImportReport, Intake, MapFile
 from pycrorm_async.progress_bar import ProgressCallback
-from pycrorm_async.query.text import nearest
 from pycrorm_async.record.recording import Recording
 
 GROUP: Final = "pycrorm.import_formats"
@@ -37,22 +36,13 @@ BUILT_IN: Final = {
 """The modules of the built-in formats, by name, loaded when they are used. `FORMAT` in each is its `ImportFormat`."""
 
 
-def format_names() -> list[str]:
-    """Return the names of the built-in formats, and of those that installed packages offer."""
-    return [*BUILT_IN, *sorted({each.name for each in entry_points(group=GROUP)} - BUILT_IN.keys())]
-
-
 def format_named(name: str) -> ImportFormat:
     """Return the format of this name. Raises `CallerError`."""
     if name in BUILT_IN:
         built_in: ImportFormat = import_module(f"pycrorm_async.imports.{BUILT_IN[name]}").FORMAT
         return built_in
-    offered = next(iter(entry_points(group=GROUP, name=name)), None)
-    if offered is None:
-        names = format_names()
-        raise CallerError(f"there is no format {name!r}{nearest(name, names)}; formats: {', '.join(names)}")
-    loaded: ImportFormat = offered.load()
-    return loaded
+    offered: ImportFormat = offered_format(GROUP, BUILT_IN, name)
+    return offered
 
 
 def read_map_file(path: Path | None, map_file: type[MapFile]) -> MapFile:

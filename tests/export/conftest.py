@@ -86,15 +86,20 @@ async def reading(kitchen: Path) -> AsyncIterator[Reading]:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def scripted(module_database_url: str) -> str:
-    """Return the URL of a memory in which episode 1 still runs and episode 2 has ended."""
-    records = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records, *episode(2).records]
-    run_in_own_loop(append_and_fold(module_database_url, records))
-    return module_database_url
+async def write_script(url: str) -> None:
+    """Make a memory in which episode 1 still runs and episode 2 has ended."""
+    await append_and_fold(url, [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records, *episode(2).records])
+
+
+@pytest.fixture(scope="session")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(
+        tmp_path_factory, "script", lambda folder: run_in_own_loop(write_script(f"sqlite:///{folder}/memory.db"))
+    )
 
 
 @pytest.fixture
-async def either(scripted: str) -> AsyncIterator[Reading]:
-    async with Reading.open(scripted) as opened:
+async def scripted(script: Path) -> AsyncIterator[Reading]:
+    """Yield a memory in which episode 1 still runs and episode 2 has ended."""
+    async with Reading.open(f"sqlite:///{script}/memory.db") as opened:
         yield opened

@@ -38,18 +38,27 @@ from pycrorm_async.export.lerobot_images import Camera
 from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.report.output_files import new_folder
 from pycrorm_async.world import Pose
+from tests.databases import run_in_own_loop
 from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, SAYING, Script, append_and_fold, declarations, name_of, pose
+from tests.shared_folders import made_once
 
 SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
 
 
+async def _export(memory: Path, dataset: Path) -> None:
+    async with Reading.open(f"sqlite:///{memory}/pycrorm.db") as reading:
+        exported = await export(reading, ["1", "2"], dataset, file_format="lerobot")
+    assert exported.rows == parquet.read_metadata(dataset / "data/chunk-000/file-000.parquet").num_rows
+
+
 @pytest.fixture
-async def dataset(reading: Reading, tmp_path: Path) -> Path:
+def dataset(kitchen: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a data set of the episodes 1 and 2, by event."""
-    exported = await export(reading, ["1", "2"], tmp_path / "kitchen", file_format="lerobot")
-    assert exported.rows == parquet.read_metadata(tmp_path / "kitchen/data/chunk-000/file-000.parquet").num_rows
-    return tmp_path / "kitchen"
+    folder = made_once(
+        tmp_path_factory, "dataset", lambda folder: run_in_own_loop(_export(kitchen, folder / "kitchen"))
+    )
+    return folder / "kitchen"
 
 
 def types_of(path: Path) -> dict[str, str]:

@@ -29,7 +29,7 @@ from sqlalchemy.orm import aliased
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.export import export as export_module
+from pycrorm_async.export import formats
 from pycrorm_async.export.export import FORMATS, datasette_metadata, export, export_again
 from pycrorm_async.export.formats import CSV, GROUP, Format, Job, Written, _write_rows
 from pycrorm_async.export.selection import read_manifest
@@ -38,6 +38,7 @@ from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.world.pose import Arms
 from tests.commands import one_line_of, pycrorm
 from tests.databases import Server
+from tests.export.conftest import write_script
 from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, append_and_fold, declarations, name_of
 from tests.query.test_reading import episode
@@ -50,8 +51,6 @@ DISK_BYTES = 40_000
 """More than SQLite's own files need."""
 ONE, OTHER = aliased(TaskTreeNode), aliased(TaskTreeNode)
 NOISE = type_coerce(func.random(), Integer())
-ON_SQLITE = pytest.mark.parametrize("module_database_url", ["sqlite"], indirect=True)
-"""The database makes no difference to what a test shows."""
 LARGE = select(ONE.dtype, *(NOISE.label(f"noise{n}") for n in range(4))).join(OTHER, true())
 
 
@@ -69,13 +68,15 @@ async def test_files_of_an_episode_with_failures_and_of_one_without_have_one_sch
     assert parquet.read_metadata(tmp_path / "2.failures.parquet").num_rows == 0
 
 
-async def test_every_format_has_the_rows_of_the_frame(either: Reading, tmp_path: Path) -> None:
+async def test_every_format_has_the_rows_of_the_frame(database_url: str, tmp_path: Path) -> None:
+    await write_script(database_url)
     view = PickUpWithContextView
     condition = view.process_metadata_id == 2
-    frame = await either.dataframe(select(view).where(condition), deferred=True)
-    for name in ("rows.parquet", "rows.csv", "rows.jsonl"):
-        exported = await export(either, "PickUpWithContextView", tmp_path / name)
-        assert (exported.rows, exported.episodes, exported.left_out) == (1, 1, 1)
+    async with Reading.open(database_url) as reading:
+        frame = await reading.dataframe(select(view).where(condition), deferred=True)
+        for name in ("rows.parquet", "rows.csv", "rows.jsonl"):
+            exported = await export(reading, "PickUpWithContextView", tmp_path / name)
+            assert (exported.rows, exported.episodes, exported.left_out) == (1, 1, 1)
     table = parquet.read_table(tmp_path / "rows.parquet")
     assert table.schema.field("arm").type == pa.dictionary(pa.int32(), pa.string())
     enums = dict.fromkeys(("arm", "grasp", "obj_type", "status"), "str")
@@ -92,23 +93,23 @@ async def test_every_format_has_the_rows_of_the_frame(either: Reading, tmp_path:
     ].dropna().to_dict()
 
 
-async def test_json_columns_are_values_in_json_lines_and_text_elsewhere(either: Reading, tmp_path: Path) -> None:
-    await export(either, "2", tmp_path / "episode.jsonl")
+async def test_json_columns_are_values_in_json_lines_and_text_elsewhere(scripted: Reading, tmp_path: Path) -> None:
+    await export(scripted, "2", tmp_path / "episode.jsonl")
     nodes = [json.loads(line) for line in (tmp_path / "episode.jsonl").read_text().splitlines()]
     assert [(each["dtype"], each["status"]) for each in nodes] == [
         (None, "SUCCEEDED"), ("NavigateAction", "SUCCEEDED"), ("SayingAction", "SUCCEEDED"), ("PickUpAction", "FAILED"),
     ]  # fmt: skip
     assert nodes[2]["parameters"] == {"text": "hi"}
     assert nodes[0]["start_time"] == "2023-11-14T22:13:22Z"
-    await export(either, "2", tmp_path / "episode.csv")
+    await export(scripted, "2", tmp_path / "episode.csv")
     assert pd.read_csv(tmp_path / "episode.csv").parameters[2] == '{"text":"hi"}'
 
 
-async def test_bytes_are_base64_in_files_of_text(either: Reading, tmp_path: Path) -> None:
+async def test_bytes_are_base64_in_files_of_text(scripted: Reading, tmp_path: Path) -> None:
     content = type_coerce(literal(b"\xff\x00\n"), LargeBinary)
     rows = select(case((ONE.dtype == "PickUpAction", content)).label("content"), ONE.id).order_by(ONE.id)
     for name in ("a.csv", "a.jsonl", "a.parquet"):
-        await export(either, rows.where(ONE.process_metadata_id == 2), tmp_path / name)
+        await export(scripted, rows.where(ONE.process_metadata_id == 2), tmp_path / name)
     assert pd.read_csv(tmp_path / "a.csv").content.dropna().tolist() == ["/wAK"]
     assert json.loads((tmp_path / "a.jsonl").read_text().splitlines()[-1])["content"] == "/wAK"
     assert parquet.read_table(tmp_path / "a.parquet").column("content")[-1].as_py() == b"\xff\x00\n"
@@ -158,23 +159,21 @@ async def test_a_question_with_a_wrong_argument_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-@ON_SQLITE
 async def test_every_question_is_exported_with_declared_types_of_episodes_that_have_ended(
-    either: Reading, tmp_path: Path
+    scripted: Reading, tmp_path: Path
 ) -> None:
     arguments: dict[str, dict[str, Any]] = {
         "object_history": {"name": "milk"}, "moves_of": {"name": "milk"}, "experience_at": {"x": 0.5, "y": 0},
     }  # fmt: skip
     changed = set()
     for name in QUESTIONS:
-        all_, ended = tmp_path / f"{name}.parquet", tmp_path / f"{name}-ended.parquet"
-        exported = await export(either, name, all_, arguments=arguments.get(name, {}))
-        assert pa.null() not in parquet.read_schema(all_).types, name
+        exported = await export(scripted, name, tmp_path / f"{name}.parquet", arguments=arguments.get(name, {}))
         assert ([each.number for each in exported.manifest.episodes], exported.left_out) == ([2], 1)
-        await export(either, name, ended, arguments=arguments.get(name, {}), episodes=["2"])
-        assert parquet.read_table(all_).to_pylist() == parquet.read_table(ended).to_pylist(), name
-        whole = await getattr(either.ask, name)(**arguments.get(name, {})).frame(to="arrow")
-        if whole.to_pylist() != parquet.read_table(all_).to_pylist():
+        table = parquet.read_table(tmp_path / f"{name}.parquet")
+        assert pa.null() not in table.schema.types, name
+        if (
+            await getattr(scripted.ask, name)(**arguments.get(name, {})).frame(to="arrow")
+        ).to_pylist() != table.to_pylist():
             changed.add(name)
     assert changed == {*QUESTIONS} - {"successful_pick_ups", "moves_of", "steps_before_failures", "streams"}
 
@@ -191,7 +190,7 @@ async def test_a_format_of_an_installed_package_is_found_by_its_suffix_and_has_a
     reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entry = EntryPoint("count", f"{__name__}:COUNT", GROUP)
-    monkeypatch.setattr(export_module, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(formats, "entry_points", lambda **_: [entry])
     monkeypatch.setattr(EntryPoint, "load", lambda _: COUNT)
     exported = await export(reading, ["1", "2"], tmp_path / "two.count")
     assert (exported.rows, (tmp_path / "two.count").read_text()) == (2, "2 episodes\n")
@@ -240,9 +239,8 @@ async def test_a_cancelled_export_closes_its_file_after_the_last_write(
     assert list(tmp_path.iterdir()) == []
 
 
-@ON_SQLITE
 async def test_parts_of_killed_exports_are_deleted_and_those_of_running_ones_kept(
-    either: Reading, tmp_path: Path
+    scripted: Reading, tmp_path: Path
 ) -> None:
     dead, running, new, other = (
         tmp_path / name
@@ -254,7 +252,7 @@ async def test_parts_of_killed_exports_are_deleted_and_those_of_running_ones_kep
             os.utime(each, (1_000_000_000, 1_000_000_000))
     with running.open() as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        await export(either, "2", tmp_path / "a.csv")
+        await export(scripted, "2", tmp_path / "a.csv")
     assert sorted(tmp_path.glob(".*")) == [running, new, other]
 
 
@@ -276,11 +274,10 @@ async def test_a_file_is_replaced_only_when_asked(reading: Reading, tmp_path: Pa
     assert file.read_text().startswith('"id"')
 
 
-@ON_SQLITE
-async def test_a_running_episode_is_refused_by_name_and_left_out_of_a_view(either: Reading, tmp_path: Path) -> None:
+async def test_a_running_episode_is_refused_by_name_and_left_out_of_a_view(scripted: Reading, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="episode 1 is still running, so its rows change"):
-        await export(either, "1", tmp_path / "a.csv")
-    exported = await export(either, "task_tree_node", tmp_path / "a.csv")
+        await export(scripted, "1", tmp_path / "a.csv")
+    exported = await export(scripted, "task_tree_node", tmp_path / "a.csv")
     assert (exported.rows, exported.left_out) == (4, 1)
 
 
@@ -314,9 +311,8 @@ async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Pat
         ("2", (), "\udcff.csv", CallerError, r"\\udcff.csv. is not UTF-8: give another name"),
     ],
 )
-@ON_SQLITE
 async def test_mistakes_are_named_and_leave_no_file(
-    either: Reading,
+    scripted: Reading,
     tmp_path: Path,
     what: str | tuple[str, ...],
     episodes: tuple[str, ...],
@@ -325,17 +321,16 @@ async def test_mistakes_are_named_and_leave_no_file(
     message: str,
 ) -> None:
     with pytest.raises(error, match=message):
-        await export(either, what, tmp_path / name, episodes=episodes)
+        await export(scripted, what, tmp_path / name, episodes=episodes)
     assert list(tmp_path.iterdir()) == []
 
 
-@ON_SQLITE
 async def test_without_pyarrow_the_error_names_the_extra(
-    either: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scripted: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtra, match=r"pip install 'pycrorm-async\[frames\]'"):
-        await export(either, "2", tmp_path / "a.csv")
+        await export(scripted, "2", tmp_path / "a.csv")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -485,9 +480,8 @@ async def test_the_manifest_makes_the_same_bytes_again(reading: Reading, tmp_pat
     assert (await export_again(reading, tmp_path / "own.csv.manifest.json", statement=own)).same
 
 
-@ON_SQLITE
-async def test_what_differs_from_the_manifest_is_named(either: Reading, tmp_path: Path) -> None:
-    await export(either, "2", tmp_path / "nodes.csv")
+async def test_what_differs_from_the_manifest_is_named(scripted: Reading, tmp_path: Path) -> None:
+    await export(scripted, "2", tmp_path / "nodes.csv")
     file = tmp_path / "nodes.csv.manifest.json"
     text = file.read_text()
     cases = {
@@ -500,18 +494,18 @@ async def test_what_differs_from_the_manifest_is_named(either: Reading, tmp_path
     }
     for old, (new, line) in cases.items():
         file.write_text(text.replace(old, new))
-        assert (await export_again(either, file)).differences == (line,)
+        assert (await export_again(scripted, file)).differences == (line,)
     file.write_text(text.replace("8000-000000000002", "8000-000000000009"))
-    remade = await export_again(either, file)
+    remade = await export_again(scripted, file)
     assert not remade.same
     assert remade.differences == (f"episode 2 ({ID[:-1]}9) is not in this memory",)
     for broken in ("{}", "not json"):
         file.write_text(broken)
         with pytest.raises(CallerError, match="is not a manifest of an export"):
-            await export_again(either, file)
+            await export_again(scripted, file)
     file.unlink()
     with pytest.raises(CallerError, match=r"^the manifest \S+ cannot be read: No such file or directory$"):
-        await export_again(either, file)
+        await export_again(scripted, file)
 
 
 async def test_a_question_is_exported_and_made_again_by_name_and_arguments(reading: Reading, tmp_path: Path) -> None:

@@ -104,10 +104,10 @@ async def test_an_mcap_file_has_frames_shapes_and_the_plan_of_the_episode(readin
 
 
 async def test_the_time_of_a_message_is_its_events_or_counts_events(reading: Reading, tmp_path: Path) -> None:
-    await export(reading, 1, tmp_path / "wall.mcap")
-    await export(reading, 1, tmp_path / "events.mcap", clock="event", fps=20)
+    await export(reading, 3, tmp_path / "wall.mcap")
+    await export(reading, 3, tmp_path / "events.mcap", clock="event", fps=20)
     walls, events = (messages_of(tmp_path / f"{name}.mcap") for name in ("wall", "events"))
-    then = await reading.as_of(1, sequence=walls[-1][1])
+    then = await reading.as_of(3, sequence=walls[-1][1])
     shown_us = then.started_at.timestamp() * 1e6 + then.time_s * 1e6
     assert abs(walls[-1][2] / 1000 - shown_us) < 2  # `started_at` has whole µs
     assert (events[-1][2] - events[0][2]) == (events[-1][1] - events[0][1]) * 50_000_000
@@ -115,7 +115,7 @@ async def test_the_time_of_a_message_is_its_events_or_counts_events(reading: Rea
         remade = await export_again(reading, tmp_path / f"{name}.mcap.manifest.json")
         assert (remade.same, remade.by_bytes, remade.differences) == (True, True, ())
     with pytest.raises(CallerError, match="choose the clock `event`, or leave fps out"):
-        await export(reading, 1, tmp_path / "ignored.mcap", fps=20)
+        await export(reading, 3, tmp_path / "ignored.mcap", fps=20)
 
 
 @pytest.mark.slow
@@ -173,7 +173,7 @@ async def test_without_its_library_the_error_names_the_extra(
     monkeypatch.setitem(sys.modules, module, None)
     extra = {"rrd": "rerun"}.get(suffix, suffix)
     with pytest.raises(MissingExtra, match=rf"pip install 'pycrorm-async\[{extra}\]'"):
-        await export(reading, 1, tmp_path / f"one.{suffix}")
+        await export(reading, 3, tmp_path / f"one.{suffix}")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -93,6 +93,6 @@ async def test_nodes_that_overlap_without_being_parent_and_child_have_lanes_of_t
 
 
 async def test_a_trace_of_two_episodes_is_refused_in_one_line(reading: Reading, tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match="holds one episode, got 2: name one, or use otlp"):
+    with pytest.raises(CallerError, match="a file of the format trace holds one episode, got 2: name one"):
         await export(reading, [1, 2], tmp_path / "two.json", file_format="trace")
     assert [*tmp_path.iterdir()] == []
