@@ -38,7 +38,21 @@ def _verb(name: str) -> Callable[..., None]:
         if sql:
             print_line(getattr(Reading(place.place.address).ask, name)(**arguments).sql)
             return
-        _answer(name, arguments, place, form, simulated=simulated)
+
+        async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
+            question: Question = getattr(reading.ask, name)(**arguments)
+            rows, unknown = await question.rows_or_unknown_name(simulated=simulated)
+            return list(question.statement.selected_columns.keys()), [tuple(row) for row in rows], unknown
+
+        columns, rows, unknown = place.read(ask)
+        if form.is_table:
+            names = [each.removesuffix("_s") for each in columns]
+            print_table(name, names, ([*map(_cell, columns, row)] for row in rows))
+        else:
+            plain = [[*map(_plain, row)] for row in rows]
+            print_rows(form, [dict(zip(columns, row, strict=True)) for row in plain], name, columns, plain)
+        if not rows and not form.as_json:
+            note(f"no row answers; {unknown or '`--sql` shows the question.'}")
 
     options = {each.name: (_option(each), each.default) for each in arguments_of(name).values()} | {
         "sql": (_SqlOption, False),
@@ -64,23 +78,6 @@ def _option(argument: Argument) -> Any:
         return Annotated[str, typer.Argument(help=argument.help)]
     flags = (f"--{argument.name}/--not-{argument.name}",) if type_ is bool else ()
     return Annotated[type_ if argument.is_required else type_ | None, typer.Option(*flags, help=argument.help)]
-
-
-def _answer(name: str, arguments: dict[str, Any], place: ReadingPlace, form: Form, *, simulated: bool) -> None:
-    async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
-        question: Question = getattr(reading.ask, name)(**arguments)
-        rows, unknown = await question.rows_or_unknown_name(simulated=simulated)
-        columns = list(question.statement.selected_columns.keys())
-        return columns, [tuple(row) for row in rows], unknown
-
-    columns, rows, unknown = place.read(ask)
-    plain = [[*map(_plain, row)] for row in rows]
-    if form.is_table:
-        print_table(name, [each.removesuffix("_s") for each in columns], ([*map(_cell, columns, row)] for row in rows))
-    else:
-        print_rows(form, [dict(zip(columns, row, strict=True)) for row in plain], name, columns, plain)
-    if not rows and not form.as_json:
-        note(f"no row answers; {unknown or '`--sql` shows the question.'}")
 
 
 def _plain(value: Any) -> Any:

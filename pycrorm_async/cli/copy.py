@@ -6,7 +6,6 @@ Panel: Hand over, 2.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -14,8 +13,8 @@ import typer
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.output import Form, print_rows, problem
 from pycrorm_async.cli.reading import DEFAULT_URL, Place, SpoolOption
-from pycrorm_async.operations.copy import CopySummary, copy_episodes
-from pycrorm_async.operations.workers import WORKERS, ChildProcess, forked
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.workers import WORKERS, forked
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.lake import PREFIX
 
@@ -45,8 +44,10 @@ def copy(
     events under one number, 1 if an episode is stopped; all other episodes are copied.
     """
     collect_seldom()
-    with forked(WORKERS, target) as processes:
-        summary = asyncio.run(_copy(source, target, episode or [], processes))
+    with forked(WORKERS, target) as processes, progress_bar("copying") as report:
+        summary = asyncio.run(
+            copy_episodes(source, target, episodes=episode or [], report_progress=report, forked=processes)
+        )
     if not source.startswith(PREFIX):
         Place(source, spool).note_pending_events()
     print_rows(
@@ -61,8 +62,3 @@ def copy(
     for line in (*damaged, *stopped):
         problem(line)
     return 4 if damaged else 1 if stopped else 0
-
-
-async def _copy(source: str, target: str, episodes: list[str], processes: Sequence[ChildProcess]) -> CopySummary:
-    with progress_bar("copying") as report_progress:
-        return await copy_episodes(source, target, episodes=episodes, report_progress=report_progress, forked=processes)

@@ -64,35 +64,24 @@ def erase(
     why = reason or (f"--keep {keep}" + "".join(f" --tag {each}" for each in tag or ()) if keep else "")
     if not why:
         raise CallerError("say why with --reason: it stays in the journal when the episode is gone")
-    return asyncio.run(_erase(place, episodes or [], keep, tag or [], why, form, lake, dry_run=dry_run, yes=yes))
 
+    async def run() -> int:
+        async with await EventLog.open(place.shared_address, create=False) as log:
+            before = None if keep is None else output.parse_since(keep)
+            rows = await removal.erasable(log, episodes or (), ended_before=before, tags=tag or ())
+        if dry_run or not rows:
+            _print(form, f"To erase from {place.address}", rows)
+            return 0
+        if not yes:
+            listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
+            ask(f"Erase {output.counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
+        async with await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id) as log:
+            spool = place.spool or place.address.default_spool
+            done = await removal.erase(log, rows, reason=why, spool=spool, lake=lake)
+        _print(form, f"Erased from {place.address}", [each.removed for each in done])
+        return name_what_is_left(done)
 
-async def _erase(
-    place: Place,
-    names: list[str],
-    keep: str | None,
-    tags: list[str],
-    reason: str,
-    form: output.Form,
-    lake: str | None,
-    *,
-    dry_run: bool,
-    yes: bool,
-) -> int:
-    async with await EventLog.open(place.shared_address, create=False) as log:
-        before = None if keep is None else output.parse_since(keep)
-        rows = await removal.erasable(log, names, ended_before=before, tags=tags)
-    if dry_run or not rows:
-        _print(form, f"To erase from {place.address}", rows)
-        return 0
-    if not yes:
-        listed = ", ".join(str(each.number) for each in rows[:_NAMED]) + ", …" * (len(rows) > _NAMED)
-        ask(f"Erase {output.counted(len(rows), 'episode')} of {place.address} for ever: {listed}?")
-    async with await EventLog.open(place.shared_address, create=True, belongs_to=log.log_id) as log:
-        spool = place.spool or place.address.default_spool
-        done = await removal.erase(log, rows, reason=reason, spool=spool, lake=lake)
-    _print(form, f"Erased from {place.address}", [each.removed for each in done])
-    return name_what_is_left(done)
+    return asyncio.run(run())
 
 
 def name_what_is_left(done: Sequence[removal.ErasedEpisode]) -> int:

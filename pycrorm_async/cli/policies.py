@@ -3,7 +3,7 @@
 Panel: Ask, 4.
 """
 
-from pycrorm_async.cli.output import Form, moment, note, print_rows, print_table
+from pycrorm_async.cli.output import Form, moment, note, print_rows
 from pycrorm_async.cli.reading import ReadingPlace
 
 
@@ -32,7 +32,4 @@ def policies(*, place: ReadingPlace, form: Form) -> None:
         )
         for each in summaries
     ]
-    if form.is_table:
-        print_table(f"Policies of {place.place.address}", columns, rows)
-    else:
-        print_rows(form, summaries, "", columns, rows)
+    print_rows(form, summaries, f"Policies of {place.place.address}", columns, rows)

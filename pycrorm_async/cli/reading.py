@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
-from pycrorm_async.cli.output import note
+from pycrorm_async.cli.output import counted, note
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress, check_replica, shared_address
 
@@ -77,7 +77,7 @@ class Place(NamedTuple):
         if dead:
             option = f" --spool {self.spool}" if self.spool else ""
             note(
-                f"{dead} dead recorder{'s' * (dead > 1)} left events that are not in the database:"
+                f"{counted(dead, 'dead recorder')} left events that are not in the database:"
                 f" run `pycrorm writer --once --url {self.address.to_type}{option}` to store them."
             )
         if alive:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from pycrorm_async.cli.output import Form, note, print_rows, print_table, stdout
+from pycrorm_async.cli.output import Form, moment, note, print_rows, print_table, stdout
 from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
@@ -182,7 +182,7 @@ def _print(answer: Answer, outcomes: list[tuple[str, int]], *, why: bool) -> Non
                 each.score,
                 each.status,
                 each.case.reason,
-                each.case.started_at.strftime("%Y-%m-%d %H:%M:%S"),
+                moment(each.case.started_at),
                 each.difference(),
                 f"pycrorm show {each.case.episode} --at e{each.case.sequence}",
             )
@@ -212,6 +212,7 @@ def _document(answer: Answer, outcomes: list[tuple[str, int]]) -> dict[str, Any]
 
 def _case(recalled: RecalledCase) -> dict[str, Any]:
     case = recalled.case
+    of_case = "status reason duration_s simulated symbols numbers".split()
     return {
         "score": recalled.score,
         "node": case.node,
@@ -219,12 +220,7 @@ def _case(recalled: RecalledCase) -> dict[str, Any]:
         "sequence": case.sequence,
         "type": case.type,
         "started": case.started_at,
-        "status": case.status,
-        "reason": case.reason,
-        "duration_s": case.duration_s,
-        "simulated": case.simulated,
-        "symbols": case.symbols,
-        "numbers": case.numbers,
+        **{name: getattr(case, name) for name in of_case},
         "matched": [each._asdict() for each in recalled.matched],
         "missed": [each._asdict() for each in recalled.missed],
     }

@@ -14,8 +14,9 @@ from pycrorm_async.cli import output
 from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
-from pycrorm_async.report.overview import Plot, overview
+from pycrorm_async.report.overview import Overview, Plot, overview
 from pycrorm_async.report.pictures import Images
+from pycrorm_async.report.write import Report
 from pycrorm_async.report.write import report as write_report
 
 
@@ -77,10 +78,16 @@ def report(
     if every and (first is not None or last is not None):
         raise CallerError("--from and --to choose events of one episode: name it instead of --all")
     if episode is None:
-        plots = [_plot(each) for each in plot or ()]
-        file = out or Path("episodes.html")
-        return _write_overview(file, choice, plots, place, force=force, images=images, as_json=as_json)
-    _write_episode(episode, out, (first, last), place, force=force, images=images, as_json=as_json)
+        plots, file = [_plot(each) for each in plot or ()], out or Path("episodes.html")
+        written = place.read(
+            lambda reading: overview(reading, file, choice=choice, plots=plots, force=force, images=images)
+        )
+        _print_overview(written, file, as_json=as_json)
+        return 1 if written.unreadable else 0
+    page = place.read(
+        lambda reading: write_report(reading, episode, out, force=force, first=first, last=last, images=images)
+    )
+    _print_episode(page, last, as_json=as_json)
     return 0
 
 
@@ -91,17 +98,7 @@ def _plot(text: str) -> Plot:
     return Plot(*names)
 
 
-def _write_overview(
-    out: Path,
-    choice: EpisodeChoice,
-    plots: list[Plot],
-    place: ReadingPlace,
-    *,
-    force: bool,
-    images: Images,
-    as_json: bool,
-) -> int:
-    written = place.read(lambda reading: overview(reading, out, choice=choice, plots=plots, force=force, images=images))
+def _print_overview(written: Overview, out: Path, *, as_json: bool) -> None:
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
         output.print_json({"file": written.path, **counts, "unreadable": written.unreadable})
@@ -117,23 +114,9 @@ def _write_overview(
             output.note("The others have no page: `pycrorm report NUMBER` writes one.")
     for number, reason in written.unreadable.items():
         output.problem(f"episode {number} has no page: {reason}")
-    return 1 if written.unreadable else 0
 
 
-def _write_episode(
-    episode: str,
-    out: Path | None,
-    window: tuple[int | None, int | None],
-    place: ReadingPlace,
-    *,
-    force: bool,
-    images: Images,
-    as_json: bool,
-) -> None:
-    first, last = window
-    written = place.read(
-        lambda reading: write_report(reading, episode, out, force=force, first=first, last=last, images=images)
-    )
+def _print_episode(written: Report, last: int | None, *, as_json: bool) -> None:
     size = written.path.stat().st_size
     if as_json:
         shown = {"first": written.first, "last": written.last, "events": written.events}

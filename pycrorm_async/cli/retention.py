@@ -140,13 +140,12 @@ async def _with_log(place: Place, act: Callable[[EventLog], Awaitable[T]], *, wr
 
 
 def _print_rules(form: output.Form, place: Place, rules: Sequence[RetentionRule]) -> None:
-    cells = [(each.number, each.keep, ", ".join(each.tags), each.archive_to or _end(each)) for each in rules]
+    cells = [
+        (each.number, each.keep, ", ".join(each.tags), each.archive_to or ("" if each.keep_s is None else "erase"))
+        for each in rules
+    ]
     document = [each._asdict() for each in rules]
     output.print_rows(form, document, f"Rules of {place.address}", ("rule", "keep", "tags", "then"), cells)
-
-
-def _end(rule: RetentionRule) -> str:
-    return "" if rule.keep_s is None else "erase"
 
 
 def _print_due(form: output.Form, title: str, due: Sequence[DueEpisode], outcomes: Mapping[str, str]) -> None:

@@ -118,7 +118,7 @@ def rebind(
 
 def _print_rebinding(planned: Rebinding) -> None:
     before = f"log {planned.before}" if planned.before else "no log"
-    events = f"{planned.events} events of {planned.recorders} recorder{'' if planned.recorders == 1 else 's'}"
+    events = f"{planned.events} events of {output.counted(planned.recorders, 'recorder')}"
     output.note(f"binding {planned.spool} to log {planned.after} (before: {before}) and storing its {events} there")
 
 

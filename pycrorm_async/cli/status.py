@@ -3,6 +3,8 @@
 Panel: Operate, 1.
 """
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from pycrorm_async import core
-from pycrorm_async.cli.output import JsonOption, moment, note, print_json, print_table, problem, stdout
+from pycrorm_async.cli.output import JsonOption, counted, moment, note, print_json, print_table, problem, stdout
 from pycrorm_async.cli.reading import ReadingPlace
 from pycrorm_async.clock import SYSTEM_CLOCK, utc_of
 from pycrorm_async.errors import DatabaseError, DatabaseForeign
@@ -68,28 +70,20 @@ def summarise_kept_segments(spool: Path) -> KeptSegments:
     )
 
 
-def print_durability(kept: KeptSegments, stored_on: StoredOn | None, went_back: Sequence[Incarnation]) -> None:
-    """Print the durability in sentences; `stored_on` is None if the database did not answer."""
-    if stored_on is not None:
-        machines, standbys = stored_on
+def durability(kept: KeptSegments, state: DatabaseState) -> Iterator[str]:
+    """Yield the durability in sentences."""
+    if state.stored_on is not None:  # else the database did not answer
+        machines, standbys = state.stored_on
         replicas = f" (synchronous standby {', '.join(standbys)})" if standbys else ""
-        stdout.print(f"A stored event is on {machines} machine{'s' * (machines > 1)}{replicas}.", markup=False)
+        yield f"A stored event is on {counted(machines, 'machine')}{replicas}."
     if kept.since is None:
-        stdout.print(
-            "No stored segments are kept; after a data loss, only events of running recorders can be stored again.",
-            markup=False,
-        )
+        yield "No stored segments are kept; after a data loss, only events of running recorders can be stored again."
     else:
-        size = f"{kept.segments:,} segment{'s' * (kept.segments != 1)}, {kept.bytes / 2**20:,.1f} MiB"
-        stdout.print(
-            f"After a data loss, events stored since {moment(kept.since)} UTC can be stored again ({size} kept).",
-            markup=False,
-        )
-    for each in went_back:
+        size = f"{counted(kept.segments, 'segment')}, {kept.bytes / 2**20:,.1f} MiB"
+        yield f"After a data loss, events stored since {moment(kept.since)} UTC can be stored again ({size} kept)."
+    for each in state.went_back:
         when = f"{moment(utc_of(each.noticed_wall_ns // 1000))} UTC"
-        stdout.print(
-            f"The database lost stored events, noticed {when} by {each.noticed_by}: {each.reason}", markup=False
-        )
+        yield f"The database lost stored events, noticed {when} by {each.noticed_by}: {each.reason}"
 
 
 # === status ===================================================================================================
@@ -238,15 +232,8 @@ def status(place: ReadingPlace, as_json: JsonOption = False) -> int:
         _print(spool, recorders, state.episodes, has_daemon=has_daemon, is_shown=is_shown)
         _print_running(state.running, state.running_total)
         _print_workers(workers)
-        print_durability(kept, state.stored_on, state.went_back)
-        if state.placement != PLAIN:
-            stdout.print(f"Placement of the memory: {state.placement}.", markup=False)
-        if state.replica is not None:
-            stdout.print(f"The replica {state.replica}.", markup=False)
-        for projection in state.projections:
-            lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
-            stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
-        stdout.print(core.description(), markup=False)
+        for line in (*durability(kept, state), *_facts(state), core.description()):
+            stdout.print(line, markup=False)
         for warning in state.warnings:
             note(f"warning: {warning}")
         if not has_daemon:
@@ -258,6 +245,17 @@ def status(place: ReadingPlace, as_json: JsonOption = False) -> int:
     for line in problems:
         problem(line)
     return 1 if problems else 0
+
+
+def _facts(state: DatabaseState) -> Iterator[str]:
+    """Yield the placement of the memory, and how far its replica and its projections are behind, in sentences."""
+    if state.placement != PLAIN:
+        yield f"Placement of the memory: {state.placement}."
+    if state.replica is not None:
+        yield f"The replica {state.replica}."
+    for projection in state.projections:
+        lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
+        yield f"The projection {projection.name}, version {projection.version}, {lag}."
 
 
 def _problems(

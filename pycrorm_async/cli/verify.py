@@ -138,38 +138,33 @@ def _print(result: VerifyResult) -> None:
     removed = f" ({result.archived:,} archived and {result.erased:,} erased episodes are not in the log)"
     is_whole = not result.archived and not result.erased
     checked = f"{folded} and {counted(result.rows, 'row')}{'' if is_whole else removed}: "
+    stdout.print(f"{checked}{_verdict(result)}", soft_wrap=True)
+
+
+def _verdict(result: VerifyResult) -> str:
     if result.rows_without_event:
-        stdout.print(
-            f"{checked}events were deleted from the log, and the tables have"
-            f" {counted(result.rows_without_event, 'row')} of them, which `pycrorm rebuild` would delete; restore a"
-            " backup, or compare digests kept elsewhere (`--digests`)",
-            soft_wrap=True,
+        rows = counted(result.rows_without_event, "row")
+        return (
+            f"events were deleted from the log, and the tables have {rows} of them, which `pycrorm rebuild` would"
+            " delete; restore a backup, or compare digests kept elsewhere (`--digests`)"
         )
-    elif result.damage:
-        stdout.print(f"{checked}the log is damaged; copy its intact events to another memory with `pycrorm copy`")
-    elif result.drift:
-        stdout.print(f"{checked}{_drift(result.undecided)}", soft_wrap=True)
-    elif result.outdated is not None:
-        stdout.print(f"{checked}the tables are outdated; run `pycrorm rebuild`")
-    elif result.stopped or result.unmade or result.failed_views:
-        views = f" {len(result.failed_views)} views are left out," if result.failed_views else ""
-        stdout.print(
-            f"{checked}{len(result.stopped)} episodes are stopped, {len(result.unmade)} types have no tables,{views}"
-            " no other problem",
-            soft_wrap=True,
+    if result.damage:
+        return "the log is damaged; copy its intact events to another memory with `pycrorm copy`"
+    if result.drift and result.undecided:
+        return (
+            f"the tables of {counted(result.undecided, 'episode')} without a digest differ from the log, so that either"
+            " these tables or these events were changed; compare them with a backup before `pycrorm rebuild`, which"
+            " makes the tables from the events"
         )
-    else:
-        stdout.print(f"{checked}no problem")
-
-
-def _drift(undecided: int) -> str:
-    if not undecided:
+    if result.drift:
         return "the log is intact, but the tables differ from it; run `pycrorm rebuild`"
-    return (
-        f"the tables of {counted(undecided, 'episode')} without a digest differ from the log, so that either these"
-        " tables or these events were changed; compare them with a backup before `pycrorm rebuild`, which makes the"
-        " tables from the events"
-    )
+    if result.outdated is not None:
+        return "the tables are outdated; run `pycrorm rebuild`"
+    if result.stopped or result.unmade or result.failed_views:
+        views = f" {len(result.failed_views)} views are left out," if result.failed_views else ""
+        stopped = f"{len(result.stopped)} episodes are stopped, {len(result.unmade)} types have no tables"
+        return f"{stopped},{views} no other problem"
+    return "no problem"
 
 
 def _document(result: VerifyResult, ids: dict[int, str]) -> dict[str, Any]:

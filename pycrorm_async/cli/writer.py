@@ -148,10 +148,8 @@ def _print(report: RecoveryReport) -> None:
     events = sum(each.records for each in drained)
     dead = len(drained) - report.living
     living = f"{report.living} living, " if report.living else ""
-    output.stdout.print(
-        f"{dead} dead recorder{'' if dead == 1 else 's'}, {living}{events} events stored,"
-        f" {report.drained.folded} folded, {len(report.lost)} episode{'' if len(report.lost) == 1 else 's'} LOST"
-    )
+    recorders, lost = output.counted(dead, "dead recorder"), output.counted(len(report.lost), "episode")
+    output.stdout.print(f"{recorders}, {living}{events} events stored, {report.drained.folded} folded, {lost} LOST")
     for episode in report.lost:
         output.stdout.print(f"  LOST {episode}")
 
