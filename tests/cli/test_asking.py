@@ -18,7 +18,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
-from tests.databases import Server, run_in_own_loop
+from tests.databases import run_in_own_loop
 from tests.projections.event_script import append_and_fold
 from tests.query.random_memory import TYPES, RandomEpisode, root_failures_of
 
@@ -70,12 +70,6 @@ def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(fold
         (["root_failure"], "root_failures"),
         (["root_failures", "--objekt", "milk"], "--object"),
         (["root_failures", "--limit", "many"], "'--limit': Input should be a valid integer"),
-        (["longest_actions", "--status", "SUCEEDED"], "did you mean SUCCEEDED?"),
-        (["durations", "--episode", "77"], "there is no episode '77' (`pycrorm episodes` lists all 7)"),
-        (
-            ["durations", "--episode", "00000000"],
-            "7 episodes have an id that begins with '00000000': use more of its digits",
-        ),
         (["episodes", "--since", "yesterday"], "'yesterday' is not a time: write 2026-11-23"),
         (["moves_of"], "missing argument 'name'"),
         (["experience_at", "--x", "1"], "missing option '--y'"),
@@ -141,11 +135,6 @@ def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets_and_colons(fold
     ("words", "says"),
     [
         (["DELETE FROM event"], "a query may only read: it is one SELECT, or WITH … SELECT; DELETE is not allowed"),
-        (["ATTACH 'planted.db' AS planted"], "ATTACH or VACUUM is not allowed"),
-        (["SELECT * FROM ':x:'"], "there is no table or view :x:; `pycrorm schema` lists them"),
-        (["SELECT * FROM root_failures"], "there is no table or view root_failures; did you mean root_failure?"),
-        (["SELECT 1; SELECT 2"], "a query is one statement: this text has several"),
-        (["SELECT 1", "--seconds", "-1"], "the limit on seconds of a query must be > 0 and finite, got -1.0"),
         (["SELECT 1", "--format", "xml"], "xml"),
         (["SELECT 1", "--json", "--format", "csv"], "exclude each other"),
     ],
@@ -154,16 +143,6 @@ def test_a_query_that_is_refused_is_answered_with_one_line(words: list[str], say
     result = pycrorm("query", *words, cwd=folder)
     assert result.returncode == 2
     assert says in one_line_of(result)
-    assert not (folder / "planted.db").exists()
-
-
-def test_on_a_server_without_the_roles_a_login_is_shown_how_to_make_the_roles(server: Server, tmp_path: Path) -> None:
-    url = server.new_database()
-    run_in_own_loop(append_and_fold(url, RECORDS[:20]))
-    result = pycrorm("query", "SELECT 1", "--url", url, cwd=tmp_path)
-    assert result.returncode == 2
-    assert "as the role pycrorm_reader: run `pycrorm roles --create` once" in one_line_of(result)
-    server.drop(url)
 
 
 # --- diff and episodes ----------------------------------------------------------------------------------------

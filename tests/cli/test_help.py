@@ -10,6 +10,7 @@ import pytest
 import typer
 from typer.core import TyperGroup
 
+from pycrorm_async import __version__
 from pycrorm_async.cli.main import app, panels
 from tests.commands import COMMAND, environment, pycrorm
 
@@ -30,6 +31,7 @@ def test_version_and_help_load_no_verb_and_no_library_but_typer(words: list[str]
         [sys.executable, "-c", program], cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False
     )
     assert done.returncode == (0 if words else 2)
+    assert done.stdout == f"pycrorm {__version__}\n" or words != ["--version"]
     loaded = done.stderr.split()
     ours = {each.removeprefix("pycrorm_async.") for each in loaded if each.startswith("pycrorm_async.")}
     former = {each for each in ours if type(sys.modules.get(f"pycrorm_async.{each}")).__name__ == "_FormerModule"}

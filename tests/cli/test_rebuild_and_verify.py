@@ -19,7 +19,6 @@ import typer
 from sqlalchemy import BigInteger, column, select, table
 from typer.core import TyperGroup
 
-import pycrorm_async
 from pycrorm_async.cli.main import app
 from pycrorm_async.events.codec import Record
 from pycrorm_async.projections.mapped_tables import UserView
@@ -242,11 +241,6 @@ def test_every_verb_that_opens_a_database_accepts_its_spool_too() -> None:
     options = {name: {option for each in verb.params for option in each.opts} for name, verb in group.commands.items()}
     assert {name for name, accepted in options.items() if "--url" in accepted and "--spool" not in accepted} == set()
     assert {"verify", "rebuild", "episodes"} <= {name for name, accepted in options.items() if "--url" in accepted}
-
-
-def test_the_command_prints_its_version(tmp_path: Path) -> None:
-    done = pycrorm("--version", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (0, f"pycrorm {pycrorm_async.__version__}\n")
 
 
 @pytest.mark.parametrize(

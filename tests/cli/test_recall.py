@@ -182,7 +182,3 @@ async def test_a_feature_with_too_many_texts_is_left_out_and_status_names_it(
     done = pycrorm("recall", GRIP, "item=cup 1", cwd=tmp_path)
     assert "item has more than 16,384 different values, so it is not compared" in one_line_of(done)
     assert answer("recall", GRIP, "arm=LEFT", cwd=tmp_path)["considered"] == 5
-
-
-def test_a_memory_that_does_not_exist_is_named(tmp_path: Path) -> None:
-    assert pycrorm("recall", GRIP, cwd=tmp_path).returncode == 3

@@ -16,12 +16,12 @@ import pytest
 from pycrorm_async import Memory
 from pycrorm_async.cli.status import RUNNING_MAX
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, parse_episode_id
+from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.sources import DeadLetters
 from pycrorm_async.queue.spool import make_folder
 from pycrorm_async.world import COURIER, BulletWorld, Object, ObjectType
 from tests.commands import NOTES_PLAN, Started, answer, one_line_of, pycrorm
-from tests.databases import ask, ask_to_change
+from tests.databases import ask_to_change
 
 pytestmark = pytest.mark.slow
 
@@ -177,34 +177,6 @@ def test_status_reports_stopped_episodes_and_how_far_the_tables_are_behind(folde
 # The exit code of `pycrorm writer --once`: 1 if the database refused anything, with and without --json.
 
 RECORDER, EPISODE = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
-FULL = (
-    f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used: move its spool to a new memory with"
-    " `pycrorm spool rebind`"
-)
-
-
-def use_up_episode_numbers(url: str) -> None:
-    taken = f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({EPISODE_NUMBER_MAX}, 'x', 0, 0)"
-    ask_to_change(url, taken)
-    if url.startswith("postgresql:"):
-        ask_to_change(url, f"SELECT setval('pycrorm.episode_number', {EPISODE_NUMBER_MAX})")
-
-
-@pytest.mark.soak_on("postgresql")
-def test_an_episode_without_a_number_is_a_problem_each_time_and_is_kept(database_url: str, tmp_path: Path) -> None:
-    (tmp_path / "notes.py").write_text(NOTES_PLAN)
-    where = ("--url", database_url, "--spool", tmp_path / "spool")
-    assert answer("writer", "--once", *where, cwd=tmp_path)["dead_letters"] == {}
-    use_up_episode_numbers(database_url)
-    pycrorm("run", "notes.py", "--writer", "daemon", *where, cwd=tmp_path)
-    document = answer("writer", "--once", *where, cwd=tmp_path, code=1)
-    [(episode, folder)] = document["dead_letters"].items()
-    assert document["stopped"] == {episode: FULL}
-    assert (document["failed"], document["events_stored"], Path(folder).is_dir()) == ({}, 1, True)
-    done = pycrorm("writer", "--once", *where, cwd=tmp_path)
-    assert done.returncode == 1
-    assert one_line_of(done) == f"pycrorm: episode {episode} is stopped: {FULL}; its events are kept in {folder}"
-    assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
 
 
 @pytest.mark.parametrize("alive", [True, False])

@@ -11,7 +11,6 @@ import pytest
 from pycrorm_async import Memory, recover
 from pycrorm_async.events.codec import Heading, encode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, ObjectAdded, PoseValue
-from pycrorm_async.operations import daemon
 from pycrorm_async.operations.daemon import Folders
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance import repair_folder
@@ -92,36 +91,6 @@ def test_a_folder_with_damage_is_scanned_whole_before_any_of_it_is_supplied_agai
         again = look(())
         assert again.held == []
         assert MISSING in str(again.failed[damaged.folder.name])
-
-
-def test_a_spool_is_scanned_again_when_its_entries_change_or_a_scan_left_a_folder(
-    tmp_path: Path, spool: Path, damaged: FolderWriter, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(daemon, "_SCAN_S_MAX", 1e9)
-    monkeypatch.setattr(daemon, "_SAME_TIME_NS", -(10**18))
-    folders = Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
-    name = damaged.folder.name
-    assert folders.is_due(())
-    [source] = folders(()).held
-    assert folders.is_due({name})  # the scan has bound the spool
-    folders({name})
-    assert not folders.is_due({name})
-    assert folders.is_due(())  # its drain has ended
-    assert folders(()).held == []  # but the folder is not free
-    assert folders.is_due(())
-    folders({name})
-    assert not folders.is_due({name})
-    (spool / "another").mkdir()
-    assert folders.is_due({name})
-    monkeypatch.setattr(daemon, "_SAME_TIME_NS", 10**18)
-    folders({name})
-    assert folders.is_due({name})  # another folder may have been made at the same time, after the scan
-    monkeypatch.setattr(daemon, "_SAME_TIME_NS", -(10**18))
-    folders({name})
-    assert not folders.is_due({name})
-    monkeypatch.setattr(daemon, "_SCAN_S_MAX", 0.0)
-    assert folders.is_due({name})
-    source.release()
 
 
 # === crafted folder ===========================================================================================

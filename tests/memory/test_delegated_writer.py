@@ -5,10 +5,8 @@ import logging
 import shutil
 import sqlite3
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import pytest
 from sqlalchemy import select
@@ -149,37 +147,29 @@ async def test_one_round_stores_what_a_live_process_has_synced_and_its_flush_ret
         assert await texts(memory) == ["a", "b"]
 
 
-@pytest.mark.parametrize("writer", ["daemon", "process"])
-async def test_a_full_spool_is_drained_and_the_plan_continues(
-    database_url: str, spool: Path, daemon: Start, writer: Literal["daemon", "process"]
-) -> None:
+async def test_a_full_spool_is_drained_and_the_plan_continues(database_url: str, spool: Path) -> None:
     tiny = replace(
         QUICKLY_SYNCED, segment_bytes=2**14, record_bytes_max=2**12, spool_bytes_max=2**17, spool_reserve_bytes=2**15
     )
-    async with memory_at(database_url, spool, tiny, writer=writer) as memory, memory.episode(description="e"):
+    async with memory_at(database_url, spool, tiny, writer="process") as memory, memory.episode(description="e"):
 
         async def many() -> None:
             for index in range(1000):
                 await NoteActionPerformable(f"{index:04}").perform()
 
         task = asyncio.create_task(many())
-        await asyncio.sleep(0.5 if writer == "daemon" else 0.0)
+        await asyncio.sleep(0)
         assert not task.done()
-        async with daemon() if writer == "daemon" else nullcontext():
-            await asyncio.wait_for(task, 60)
-            await memory.flush()
-            assert await texts(memory) == [f"{index:04}" for index in range(1000)]
-            assert memory.status.faults.total == 0
+        await asyncio.wait_for(task, 60)
+        await memory.flush()
+        assert await texts(memory) == [f"{index:04}" for index in range(1000)]
+        assert memory.status.faults.total == 0
 
 
-@pytest.mark.parametrize("writer", ["daemon", "process"])
 async def test_a_flush_reports_a_parked_episode_once_and_the_others_continue(
-    database_url: str, spool: Path, daemon: Start, writer: Literal["daemon", "process"]
+    database_url: str, spool: Path, daemon: Start
 ) -> None:
-    async with (
-        memory_at(database_url, spool, writer=writer) as memory,
-        daemon() if writer == "daemon" else nullcontext(),
-    ):
+    async with memory_at(database_url, spool) as memory, daemon():
         async with memory.episode(description="parked") as parked:
             await NoteActionPerformable("a").perform()
             await memory.flush()

@@ -38,7 +38,7 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Po
 from tests.bullet import ENGINE, INSTALLED_ENGINES
 from tests.commands import answer, one_line_of, pycrorm, run_script
 from tests.databases import Server, ask, ask_to_change, change_each
-from tests.memory.note_actions import NoteActionPerformable, texts
+from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 from tests.projections.verify_cases import TYPES, full
 from tests.store.factories import episode, run_of
 from tests.table_comparison import differences, tables_of
@@ -381,10 +381,9 @@ async def episodes_of(memory: Memory) -> list[ProcessMetaData]:
         return list(await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id)))
 
 
-async def test_an_episode_holds_source_libraries_settings_and_clock(database_url: str, tmp_path: Path) -> None:
+async def test_an_episode_holds_source_libraries_settings_and_clock(tmp_path: Path) -> None:
     settings = Settings(sync_interval_ms=20, on_full="fail")
-    spool = tmp_path / "spool"
-    async with Memory.open(database_url, spool=spool, settings=settings, plan_source=SOURCE) as memory:
+    async with Memory.open(url_of(tmp_path), settings=settings, plan_source=SOURCE) as memory:
         async with memory.episode(description="with all"):
             pass
         (episode,) = await episodes_of(memory)
@@ -401,9 +400,9 @@ async def test_an_episode_holds_source_libraries_settings_and_clock(database_url
     assert "password" not in str(episode.settings)
 
 
-async def test_what_is_not_known_is_null(database_url: str, tmp_path: Path) -> None:
+async def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     own_clock = Clock(SYSTEM_CLOCK.wall_ns, SYSTEM_CLOCK.monotonic_ns)
-    async with Memory.open(database_url, spool=tmp_path / "spool", clock=own_clock) as memory:
+    async with Memory.open(url_of(tmp_path), clock=own_clock) as memory:
         async with memory.episode(description="without source"):
             pass
         (episode,) = await episodes_of(memory)
@@ -411,9 +410,8 @@ async def test_what_is_not_known_is_null(database_url: str, tmp_path: Path) -> N
     assert (episode.clock_synchronized, episode.clock_error_us, episode.world) == (None,) * 3
 
 
-@pytest.mark.soak_on("postgresql")
-async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(database_url: str, tmp_path: Path) -> None:
-    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
 
         async def scenes() -> Sequence[str | None]:
             await memory.flush()
@@ -430,9 +428,8 @@ async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(data
         assert await scenes() == [f"BulletWorld (DIRECT, {ENGINE}): pr2 (ROBOT), milk (MILK)"]
 
 
-@pytest.mark.soak_on("postgresql")
-async def test_a_world_that_is_entered_inside_an_episode_is_described(database_url: str, tmp_path: Path) -> None:
-    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+async def test_a_world_that_is_entered_inside_an_episode_is_described(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="left before the end"):
             with BulletWorld(), simulated_robot:
                 Object("pr2", ObjectType.ROBOT)

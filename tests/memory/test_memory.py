@@ -20,15 +20,11 @@ from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
     DatabaseUnavailable,
-    EpisodeParked,
     FlushTimeout,
     SpoolForeign,
     SpoolStuck,
     UnknownUrl,
 )
-from pycrorm_async.events.codec import Heading, encode, fingerprint, short_name
-from pycrorm_async.events.types import NodeStarted
-from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan import PlanFailure
 from pycrorm_async.plan.execution import recorder
@@ -212,23 +208,6 @@ async def test_a_memory_that_is_not_open_names_the_call_that_opens_it(tmp_path: 
 
 
 @pytest.mark.slow
-async def test_a_foreign_table_with_a_used_name_is_named_and_parks_that_type_until_a_rebuild(tmp_path: Path) -> None:
-    in_the_way = r"note_action already exists: rename your table or view, then run `pycrorm rebuild`"
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with sqlite3.connect(tmp_path / "memory.db") as plain:
-            plain.execute("CREATE TABLE note_action (mine TEXT)")
-        await NoteActionPerformable("a").perform()
-        with pytest.raises(EpisodeParked, match=in_the_way):
-            await memory.flush()
-    with plain:
-        plain.execute("ALTER TABLE note_action RENAME TO my_notes")
-    plain.close()
-    assert (await rebuild_memory(url_of(tmp_path))).parked == {}
-    async with Memory.open(url_of(tmp_path)) as memory:
-        assert await texts(memory) == ["a"]
-
-
-@pytest.mark.slow
 async def test_closing_logs_a_parked_episode_and_raises_nothing_over_a_plan_that_succeeded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -245,22 +224,6 @@ async def test_closing_logs_a_parked_episode_and_raises_nothing_over_a_plan_that
         (str(episode), True)
     ]
     assert [*done["unmade"]] == ["NoteAction"]
-
-
-@pytest.mark.slow
-async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        queue = memory._open_parts.queue
-        payload = b'{"kind":"action","dtype":"DreamAction","table":"dream_action","fields":[{"type":"dream"}]}'
-        queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), payload)
-        with pytest.raises(EpisodeParked, match="cannot read the declaration of its type"):
-            async with memory.episode(description="newer") as episode:
-                started = NodeStarted("action", 2, short_name(fingerprint(payload)))
-                queue.put_nowait(Heading(episode.id, "NodeStarted", 1), encode(started))
-                await memory.flush()
-        await NoteActionPerformable("fine").perform()
-        await memory.flush()
-        assert await texts(memory) == ["fine"]
 
 
 @pytest.mark.slow

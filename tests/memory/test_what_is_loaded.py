@@ -34,15 +34,10 @@ def run(code: str, *arguments: object) -> Any:
     return json.loads(done.stdout)
 
 
-def test_importing_a_memory_to_record_loads_nothing_that_reads_plans_or_draws() -> None:
-    tables = "pycrorm_async.query", "pycrorm_async.projections", "pycrorm_async.operations"
-    code = f"from pycrorm_async import Memory\nprint(json.dumps(loaded(*READS, *OTHERS, *{tables})))"
-    assert run(code) == []
-
-
 RECORDED = """
 from pycrorm_async import Memory
 
+imported = loaded(*READS, *OTHERS, *(f"pycrorm_async.{each}" for each in ("query", "projections", "operations")))
 with Memory.sync(sys.argv[1], writer=sys.argv[2]) as memory:
     drive = memory.recording.type("action", "Drive", {"speed": float})
     with memory.recording.episode(description="another executive") as episode:
@@ -54,11 +49,11 @@ with Memory.sync(sys.argv[1], writer=sys.argv[2]) as memory:
 """
 
 
-def test_recording_another_executive_loads_no_mapped_classes_queries_or_plans(tmp_path: Path) -> None:
-    unused = "print(json.dumps(loaded('pycrorm_async.plan', 'pycrorm_async.orm', 'pycrorm_async.report')))"
-    assert run(RECORDED + unused, f"sqlite:///{tmp_path}/thread.db", "thread") == []
-    nothing = "print(json.dumps(loaded(*READS, *OTHERS, 'pycrorm_async.query')))"
-    assert run(RECORDED + nothing, f"sqlite:///{tmp_path}/daemon.db", "daemon") == []
+def test_importing_a_memory_and_recording_load_nothing_that_reads_plans_or_draws(tmp_path: Path) -> None:
+    unused = "print(json.dumps([imported, loaded('pycrorm_async.plan', 'pycrorm_async.orm', 'pycrorm_async.report')]))"
+    assert run(RECORDED + unused, f"sqlite:///{tmp_path}/thread.db", "thread") == [[], []]
+    nothing = "print(json.dumps([imported, loaded(*READS, *OTHERS, 'pycrorm_async.query')]))"
+    assert run(RECORDED + nothing, f"sqlite:///{tmp_path}/daemon.db", "daemon") == [[], []]
 
 
 PLANNED_LATER = """

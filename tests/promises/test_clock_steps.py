@@ -21,7 +21,8 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.recall.answer import Relation
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.overview import overview_document
-from tests.databases import ask
+from tests.databases import ask, put_memory, run_in_own_loop
+from tests.shared_folders import made_once
 
 NOW_NS = 1_800_000_000_000_000_000
 HOUR, YEARS_57 = 3_600, 57 * 365 * 86_400
@@ -78,7 +79,7 @@ RUNS: list[tuple[SetClock, list[int]]] = []
 """The clock and the steps of the episode that is being recorded."""
 
 
-async def record(url: str, spool: Path) -> None:
+async def record(url: str, spool: Path | None = None) -> None:
     """Record one episode for each of the steps, each by a program of its own."""
     for name, steps in STEPS.items():
         clock = SetClock()
@@ -92,6 +93,15 @@ async def record(url: str, spool: Path) -> None:
             await Round(1.5).perform()
             clock.advance(0.5)
         RUNS.pop()
+
+
+@pytest.fixture
+def stepped(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the URL of a memory with these episodes."""
+    folder = made_once(
+        tmp_path_factory, "stepped", lambda folder: run_in_own_loop(record(put_memory(folder / "memory.db")))
+    )
+    return f"sqlite:///{folder}/memory.db"
 
 
 def assert_alike(read: dict[int, Any]) -> None:
@@ -123,13 +133,8 @@ async def test_every_view_has_the_durations_of_the_monotonic_clock(database_url:
         assert_alike(rows)
 
 
-@pytest.mark.soak_on("postgresql")
-async def test_every_answer_about_an_episode_has_the_times_of_the_monotonic_clock(
-    database_url: str, tmp_path: Path
-) -> None:
-    url = database_url
-    await record(url, tmp_path / "spool")
-    async with Reading.open(url) as reading:
+async def test_every_answer_about_an_episode_has_the_times_of_the_monotonic_clock(stepped: str, tmp_path: Path) -> None:
+    async with Reading.open(stepped) as reading:
         log = await reading.log()
 
         async def summary(number: int) -> Any:
@@ -183,10 +188,8 @@ async def test_every_answer_about_an_episode_has_the_times_of_the_monotonic_cloc
         ]
 
 
-async def test_remembered_actions_have_the_order_of_the_monotonic_clock(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/memory.db"
-    await record(url, tmp_path / "spool")
-    async with Memory.open(url, spool=tmp_path / "spool") as memory:
+async def test_remembered_actions_have_the_order_of_the_monotonic_clock(stepped: str) -> None:
+    async with Memory.open(stepped) as memory:
 
         async def relations(number: int) -> Any:
             walks = [each.id for each in await memory.reading.tree(number) if each.dtype == "WalkAction"]
@@ -199,12 +202,10 @@ async def test_remembered_actions_have_the_order_of_the_monotonic_clock(tmp_path
         assert_alike(await each_episode(relations))
 
 
-async def test_no_time_passes_on_the_clock_of_an_episode_until_it_is_tagged(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/memory.db"
-    await record(url, tmp_path / "spool")
+async def test_no_time_passes_on_the_clock_of_an_episode_until_it_is_tagged(stepped: str) -> None:
     later = SetClock()
     later.advance(0, YEARS_57)
-    async with Reading.open(url) as reading:
+    async with Reading.open(stepped) as reading:
         log = await reading.log()
         await tag_episode(log.address, "1", ("late",), (), clock=later.clock)
         *_, end, tagging = await log.events(1)

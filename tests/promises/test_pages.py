@@ -6,8 +6,9 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 import typer
@@ -421,9 +422,14 @@ def test_the_configurations_on_the_pages_can_be_read() -> None:
         check_options([Path(server["command"]).name, *server["args"]])
 
 
+@cache
+def command_of(verb: str) -> Any:
+    return typer.main.get_command(app(verb))
+
+
 def options_of(words: list[str]) -> set[str]:
     """Return the options of the verb that begins the words, or of the verb of a group."""
-    command = typer.main.get_command(app(words[1]))
+    command = command_of(words[1])
     for word in words[1:]:
         if not isinstance(command, TyperGroup):
             break
