@@ -24,9 +24,9 @@ async def lose_event(log: EventLog, number: int, sequence: int) -> None:
         await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = {number} AND sequence = {sequence}")
 
 
-async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Projector:
-    """Return a projector that has folded all of these scripts."""
-    projector = Projector(log)
+async def stored_and_folded(log: EventLog, records: Sequence[Record], **options: Any) -> Projector:
+    """Return a projector with these options that has folded all of these records."""
+    projector = Projector(log, **options)
     await projector.open()
     await log.append(records)
     await projector.catch_up()

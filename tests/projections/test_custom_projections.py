@@ -46,7 +46,7 @@ from tests.projections.event_script import (
     pose,
     row,
 )
-from tests.projections.sql_queries import ask, lose_event, names
+from tests.projections.sql_queries import ask, lose_event, names, stored_and_folded
 from tests.projections.verify_cases import rebuilt
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
@@ -106,11 +106,7 @@ def rows_of(episode: int, many: Sequence[Any] = TRIES) -> list[tuple[Any, ...]]:
 
 
 async def folded(log: EventLog, records: Sequence[Any], *projections: Projection, **options: Any) -> Projector:
-    projector = Projector(log, projections=projections, **options)
-    await projector.open()
-    await log.append(records)
-    await projector.catch_up()
-    return projector
+    return await stored_and_folded(log, records, projections=projections, **options)
 
 
 async def visible_rows(log: EventLog) -> list[tuple[Any, ...]]:

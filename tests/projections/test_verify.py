@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,9 @@ from pycrorm_async.projections.findings import TableDifference
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_to_change, change_each
+from tests.databases import ask, put_memory, run_in_own_loop
 from tests.projections.event_script import Script
 from tests.projections.verify_cases import (
-    PreparedMemory,
     another,
     assert_clean,
     delete,
@@ -27,22 +27,26 @@ from tests.projections.verify_cases import (
     full,
     in_own_loop,
     in_parts,
-    insertion,
+    insert,
     look,
     lost,
     opened,
     parked,
     rebuilt,
     rows_of,
-    rows_of_each,
     running,
     set_columns,
     visible_tables,
 )
 from tests.promises.test_random_plans import play
 
-pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def database_url(tmp_path: Path) -> str:
+    """Use SQLite alone: other modules verify memories on a server."""
+    return put_memory(tmp_path / "memory.db")
 
 
 async def fill(url: str) -> None:
@@ -54,17 +58,18 @@ async def fill(url: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedMemory:
-    return PreparedMemory(fill, tmp_path_factory.mktemp("prepared"))
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("prepared") / "memory.db"
+    run_in_own_loop(fill(f"sqlite:///{file}"))
+    return file
 
 
 @pytest.fixture
-async def log(database_url: str, prepared: PreparedMemory) -> AsyncIterator[EventLog]:
-    """Open a log of these episodes, on each kind of database."""
-    await prepared.put_at(database_url)
-    log_of_episodes = await opened(database_url)
-    yield log_of_episodes
-    await log_of_episodes.close()
+async def log(database_url: str, prepared: Path) -> AsyncIterator[EventLog]:
+    """Open a log of these episodes."""
+    shutil.copyfile(prepared, database_url.removeprefix("sqlite:///"))
+    async with await opened(database_url) as log_of_episodes:
+        yield log_of_episodes
 
 
 # --- no differences ---------------------------------------------------------------------------------------------------
@@ -81,7 +86,7 @@ async def test_verify_finds_nothing_in_random_plans_with_failures(
     assert_clean(result)
     assert (result.episodes, result.behind) == (10, 0)
     assert result.events == ask(database_url, "SELECT count(*) FROM event")[0][0]
-    assert result.rows == sum(map(len, rows_of_each(database_url, visible_tables(database_url))))
+    assert result.rows == sum(len(rows_of(database_url, each)) for each in visible_tables(database_url))
     for events in (60, 400):
         assert findings(await in_parts(log, events, monkeypatch)) == findings(result)
     await log.close()
@@ -173,7 +178,7 @@ async def test_every_changed_value_is_reported_and_nothing_else(log: EventLog, d
             continue
         filled += 1
         row = rows[len(rows) // 2]
-        values = {each: another(row[each], table.kinds[each]) for each in table.columns if each not in table.key}
+        values = {each: another(row[each], table.kinds[each]) for each in table.kinds if each not in table.key}
         if not values:
             continue
         set_columns(database_url, table, row, values)
@@ -194,9 +199,9 @@ async def test_a_deleted_row_is_reported(log: EventLog, database_url: str) -> No
         for row in rows_of(database_url, table)[-1:]:
             delete(database_url, table, row)
             number, sequence = event_of(table, row)
-            whole = tuple(row[each] for each in table.columns)
+            whole = tuple(row.values())
             assert (await look(log)).differences == [TableDifference(number, sequence, table.name, None, None, whole)]
-            ask_to_change(database_url, insertion(table, row))
+            insert(database_url, table, row)
     assert_clean(await look(log))
 
 
@@ -208,18 +213,17 @@ async def test_a_deleted_row_is_reported(log: EventLog, database_url: str) -> No
 async def test_a_row_without_an_event_is_reported_in_every_table(
     log: EventLog, database_url: str, number: int, sequence: int
 ) -> None:
-    expected, insertions = [], []
+    expected = []
     for table in visible_tables(database_url):
-        added: dict[str, Any] = dict.fromkeys(table.columns)
+        added: dict[str, Any] = dict.fromkeys(table.kinds)
         added |= {each: "x" if "text" in table.kinds[each] else 0 for each in table.key}
         of_episode = table.name in ("process_metadata", "simulated_episode")
         if of_episode and number in (1, 6):
             continue
         added["id" if "id" in table.key else table.key[0]] = number if of_episode else number * 2**31 + sequence * 32
-        insertions.append(insertion(table, added))
+        insert(database_url, table, added)
         event = (number, 1) if of_episode else (number, sequence)
-        expected.append(TableDifference(*event, table.name, None, tuple(added[each] for each in table.columns), None))
-    change_each(database_url, insertions)
+        expected.append(TableDifference(*event, table.name, None, tuple(added.values()), None))
     result = await look(log)
     assert sorted(result.differences, key=repr) == sorted(expected, key=repr)
     assert result.drift == len(expected) > 30

@@ -15,10 +15,9 @@ from pycrorm_async.events.codec import encode, fingerprint, short_name
 from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_each, ask_to_change
+from tests.databases import ask, ask_each, ask_to_change, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP
 from tests.projections.verify_cases import (
-    PreparedMemory,
     assert_clean,
     fold_in_batches,
     full,
@@ -26,15 +25,13 @@ from tests.projections.verify_cases import (
     look,
     opened,
     rows_of,
-    rows_of_each,
     set_columns,
     unlock,
     verified,
     visible_tables,
 )
 
-pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
+pytestmark = pytest.mark.slow
 
 
 async def fill(url: str, rounds_of_second: int = 1) -> None:
@@ -46,14 +43,20 @@ async def fill(url: str, rounds_of_second: int = 1) -> None:
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedMemory:
-    return PreparedMemory(fill, tmp_path_factory.mktemp("prepared"))
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("prepared") / "memory.db"
+    run_in_own_loop(fill(f"sqlite:///{file}"))
+    return file
 
 
 @pytest.fixture
-async def log(database_url: str, prepared: PreparedMemory) -> AsyncIterator[EventLog]:
-    """Open for reading a log of three episodes with twenty events each, in a database that lets its log be changed."""
-    await prepared.put_at(database_url)
+def database_url(tmp_path: Path, prepared: Path) -> str:
+    """Three episodes with twenty events each, in a SQLite file that lets its log be changed."""
+    return f"sqlite:///{shutil.copyfile(prepared, tmp_path / 'memory.db')}"
+
+
+@pytest.fixture
+async def log(database_url: str) -> AsyncIterator[EventLog]:
     reader = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
     yield reader
     await reader.close()
@@ -62,7 +65,7 @@ async def log(database_url: str, prepared: PreparedMemory) -> AsyncIterator[Even
 def everything(url: str) -> list[Any]:
     """Return all rows of log and tables."""
     logged = [f"SELECT * FROM {name} ORDER BY 1, 2" for name in ("event", "episode", "pycrorm_declaration")]
-    return [*ask_each(url, logged), *rows_of_each(url, visible_tables(url))]
+    return [*ask_each(url, logged), *(rows_of(url, each) for each in visible_tables(url))]
 
 
 async def findings_for_any_parts(log: EventLog, url: str, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:

@@ -158,22 +158,10 @@ async def test_the_pick_up_view_has_the_robots_position_in_the_frame_of_the_obje
     await stored_and_folded(log, [*declarations(PICK_UP), *script.records])
     view = PickUpWithContextView
     async with AsyncSession(log.engine) as session:
-        (seen,) = await session.execute(
-            select(
-                view.robot_in_object_x, view.robot_in_object_y, view.robot_in_object_z,
-                view.robot_in_object_qx, view.robot_in_object_qy, view.robot_in_object_qz, view.robot_in_object_qw,
-            )
-        )  # fmt: skip
-        former = (
-            view.object_x,
-            view.object_y,
-            view.object_z,
-            view.object_qx,
-            view.object_qy,
-            view.object_qz,
-            view.object_qw,
-        )
-        assert (await session.execute(select(*former))).one() == seen
+        names = "x y z qx qy qz qw".split()
+        (seen,) = await session.execute(select(*(getattr(view, f"robot_in_object_{each}") for each in names)))
+        former = select(*(getattr(view, f"object_{each}") for each in names))
+        assert (await session.execute(former)).one() == seen
     object_rotation = turn(axis, angle)
     np.testing.assert_allclose(seen[:3], object_rotation.T @ (stand - object_position), atol=1e-12)
     # The robot's heading as a direction, which the quaternion rotates into the object's frame.

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
-import shutil
 import threading
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -40,13 +37,13 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections import verify as parts
 from pycrorm_async.projections.custom import Projection
 from pycrorm_async.projections.findings import VerifyResult
-from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_each, ask_to_change, change_each
+from tests.databases import ask, ask_to_change, change_each
 from tests.projections.event_script import NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
+from tests.projections.sql_queries import stored_and_folded
 
 EVERY = declared(
     "EveryAction",
@@ -219,89 +216,43 @@ async def opened(url: str) -> EventLog:
 
 async def fold_in_batches(log: EventLog, scripts: Sequence[Script], events: int) -> None:
     """Store them at once, and fold this many events at a time."""
-    projector = Projector(log, batch_events=events)
-    await projector.open()
-    await log.append([*TYPES, *(each for script in scripts for each in script.records)])
-    await projector.catch_up()
+    records = [*TYPES, *(each for script in scripts for each in script.records)]
+    await stored_and_folded(log, records, batch_events=events)
 
 
-class PreparedMemory:
-    """A memory for each test of a module: made with `fill`, on SQLite once and then copied."""
-
-    def __init__(self, fill: Callable[[str], Awaitable[None]], folder: Path) -> None:
-        self._fill = fill
-        self._file = folder / "memory.db"
-
-    async def put_at(self, url: str) -> None:
-        """Fill the new database of this URL."""
-        if url.startswith("postgresql:"):
-            await self._fill(url)
-            return
-        if not self._file.exists():
-            await self._fill(f"sqlite:///{self._file}")
-        shutil.copyfile(self._file, url.removeprefix("sqlite:///"))
-
-
-# --- changes ----------------------------------------------------------------------------------------------------------
+# --- changes of a SQLite file -------------------------------------------------------------------------------------
 
 
 class VisibleTable(NamedTuple):
-    """A table as it is in the database."""
+    """A table as it is in the database: the types of its columns, and those of its key."""
 
     name: str
     physical: str
-    columns: list[str]
-    key: list[str]
     kinds: dict[str, str]
+    key: list[str]
 
 
 def visible_tables(url: str) -> list[VisibleTable]:
     """Return every table that readers see, queried from the database itself."""
-    on_server = url.startswith("postgresql:")
-    schema = "memory_tables." if on_server else ""
-    if on_server:
-        [(number,)] = ask(url, "SELECT generation FROM memory_tables.pycrorm_generation WHERE projection = 'tables'")
-        listed = ask(
-            url,
-            "SELECT table_name::text, column_name::text, data_type::text, EXISTS (SELECT FROM pg_index"
-            " JOIN pg_attribute ON attrelid = indrelid AND attnum = ANY (indkey)"
-            " WHERE indisprimary AND attname = column_name AND indrelid"
-            " = format('memory_tables.%I', table_name)::regclass)"
-            " FROM information_schema.columns WHERE table_schema = 'memory_tables' ORDER BY 1, ordinal_position",
-        )
-    else:
-        [(number,)] = ask(url, "SELECT generation FROM pycrorm_generation WHERE projection = 'tables'")
-        listed = ask(
-            url,
-            "SELECT each.name, part.name, part.type, part.pk > 0 FROM sqlite_master AS each"
-            " JOIN pragma_table_info(each.name) AS part WHERE each.type = 'table' ORDER BY each.name, part.cid",
-        )
+    [(number,)] = ask(url, "SELECT generation FROM pycrorm_generation WHERE projection = 'tables'")
+    listed = ask(
+        url,
+        "SELECT each.name, part.name, part.type, part.pk > 0 FROM sqlite_master AS each"
+        " JOIN pragma_table_info(each.name) AS part WHERE each.type = 'table' ORDER BY each.name, part.cid",
+    )
     tables: dict[str, VisibleTable] = {}
     for physical, column, kind, is_key in listed:
-        name, mark, generation = physical.rpartition("__")
-        name = name.removeprefix("zz_")
+        name, mark, generation = physical.removeprefix("zz_").rpartition("__")
         if not mark or generation != str(number) or name.startswith("pycrorm_"):
             continue
-        table = tables.setdefault(name, VisibleTable(name, f'{schema}"{physical}"', [], [], {}))
-        table.columns.append(column)
+        table = tables.setdefault(name, VisibleTable(name, physical, {}, []))
         table.kinds[column] = kind.lower()
         if is_key:
             table.key.append(column)
     for table in tables.values():
         if not table.key:  # the rows of one event differ in a name
-            table.key.extend(each for each in table.columns if each in ("id", "joint", "channel"))
+            table.key.extend(each for each in table.kinds if each in ("id", "joint", "channel"))
     return list(tables.values())
-
-
-def literal(value: Any, kind: str) -> str:
-    """Return the value as SQL text."""
-    if value is None:
-        return "NULL"
-    if kind == "boolean":
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return "'" + value.replace("'", "''") + "'"
-    return json.dumps(value)
 
 
 def another(value: Any, kind: str) -> Any:
@@ -313,24 +264,10 @@ def another(value: Any, kind: str) -> Any:
     return (value or 0) + (0.5 if "double" in kind else 1)
 
 
-def where(table: VisibleTable, row: dict[str, Any]) -> str:
-    return " AND ".join(f'"{each}" = {literal(row[each], table.kinds[each])}' for each in table.key)
-
-
 def rows_of(url: str, table: VisibleTable) -> list[dict[str, Any]]:
-    return rows_of_each(url, [table])[0]
-
-
-def rows_of_each(url: str, tables: Sequence[VisibleTable]) -> list[list[dict[str, Any]]]:
-    """Return the rows of each of the tables, in the order of their keys."""
-    queries = []
-    for table in tables:
-        listed, order = (", ".join(f'"{each}"' for each in names) for names in (table.columns, table.key))
-        queries.append(f"SELECT {listed} FROM {table.physical} ORDER BY {order}")
-    return [
-        [dict(zip(table.columns, row, strict=True)) for row in rows]
-        for table, rows in zip(tables, ask_each(url, queries), strict=True)
-    ]
+    """Return the rows of a table, in the order of their keys."""
+    rows = ask(url, f'SELECT * FROM "{table.physical}" ORDER BY {", ".join(table.key)}')
+    return [dict(zip(table.kinds, row, strict=True)) for row in rows]
 
 
 def event_of(table: VisibleTable, row: dict[str, Any]) -> tuple[int, int]:
@@ -341,17 +278,19 @@ def event_of(table: VisibleTable, row: dict[str, Any]) -> tuple[int, int]:
     return key // 2**31, key // 2**5 % 2**26
 
 
-def insertion(table: VisibleTable, row: dict[str, Any]) -> str:
-    """Return the statement that inserts this row."""
-    names = ", ".join(f'"{each}"' for each in table.columns)
-    values = ", ".join(literal(row[each], table.kinds[each]) for each in table.columns)
-    return f"INSERT INTO {table.physical} ({names}) VALUES ({values})"
+def insert(url: str, table: VisibleTable, row: dict[str, Any]) -> None:
+    ask_to_change(url, f'INSERT INTO "{table.physical}" VALUES ({", ".join("?" * len(row))})', row.values())
 
 
 def set_columns(url: str, table: VisibleTable, row: dict[str, Any], values: dict[str, Any]) -> None:
-    changes = ", ".join(f'"{each}" = {literal(value, table.kinds[each])}' for each, value in values.items())
-    ask_to_change(url, f"UPDATE {table.physical} SET {changes} WHERE {where(table, row)}")
+    changes = ", ".join(f'"{each}" = ?' for each in values)
+    parameters = (*values.values(), *map(row.get, table.key))
+    ask_to_change(url, f'UPDATE "{table.physical}" SET {changes} WHERE {_is_row(table)}', parameters)
 
 
 def delete(url: str, table: VisibleTable, row: dict[str, Any]) -> None:
-    ask_to_change(url, f"DELETE FROM {table.physical} WHERE {where(table, row)}")
+    ask_to_change(url, f'DELETE FROM "{table.physical}" WHERE {_is_row(table)}', map(row.get, table.key))
+
+
+def _is_row(table: VisibleTable) -> str:
+    return " AND ".join(f'"{each}" = ?' for each in table.key)

@@ -262,7 +262,6 @@ async def opened(url: str) -> None:
 @pytest.mark.parametrize(
     ("host", "parameters", "asks", "refused"),
     [
-        ("localhost", "sslmode=require", False, None),
         ("localhost", "sslmode=verify-full&sslrootcert={}/ca.crt", False, None),
         ("127.0.0.1", "sslmode=verify-ca&sslrootcert={}/ca.crt", False, None),
         (
@@ -277,7 +276,6 @@ async def opened(url: str) -> None:
             False,
             "certificate is not accepted: IP address mismatch",
         ),
-        ("localhost", "sslmode=verify-ca&sslrootcert={}/other.crt", False, "certificate is not accepted"),
         (
             "localhost",
             "sslmode=verify-full&sslrootcert={}/none.crt",

@@ -279,19 +279,10 @@ ATTACKS: dict[str, Sequence[str]] = {
 }
 
 
-@pytest.fixture(params=["superuser"])
-async def owner(request: pytest.FixtureRequest, server: Server, tmp_path: Path) -> str:
+@pytest.fixture
+async def owner(server: Server, tmp_path: Path) -> str:
     """Return the URL of the owner of a memory with roles and with one action in its tables."""
     url = server.new_database()
-    database = urlsplit(url).path.removeprefix("/")
-    if request.param == "ordinary":
-        ask(url, f"CREATE ROLE owner_of_{database} LOGIN CREATEROLE")
-        ask(url, f"ALTER DATABASE {database} OWNER TO owner_of_{database}")
-        for role in ("recorder", "folder", "reader"):
-            with suppress(Exception):
-                ask(url, f"CREATE ROLE pycrorm_{role}")
-        ask(url, f"GRANT pycrorm_folder TO owner_of_{database}")
-        url = server.url(database, user=f"owner_of_{database}")
     await _record_one(url, tmp_path / "spool", "first", 1)
     change_each(url, GRANTS)
     return url
@@ -354,8 +345,6 @@ async def test_a_folder_cannot_rewrite_the_log_by_code_that_the_owner_executes(
     assert ask(owner, enabled) == [(b"O",)]
 
 
-@pytest.mark.soak_on("superuser")
-@pytest.mark.parametrize("owner", ["superuser", "ordinary"], indirect=True)
 async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_the_owner_appended(
     owner: str, server: Server, tmp_path: Path
 ) -> None:
