@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,13 +43,11 @@ class _FaultyLog(ForwardingDestination):
         super().__init__(CountingFold(log))
         self._rng = rng
 
-    async def append(
-        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
-    ) -> Mapping[EpisodeId, str]:
+    async def append(self, *batch: Any, **options: Any) -> Mapping[EpisodeId, str]:
         chance = self._rng.random()
         if chance < 0.2:
             raise DatabaseUnavailable("unavailable before the append")
-        refused = await super().append(records, on_wait)
+        refused = await super().append(*batch, **options)
         if chance < 0.4:
             raise DatabaseUnavailable("the reply to the COMMIT was lost")
         return refused

@@ -7,6 +7,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
+from typing import Any
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import Record
@@ -112,10 +113,8 @@ class CountingFold(Destination):
     def __init__(self, log: EventLog) -> None:
         self.log = log
 
-    async def append(
-        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
-    ) -> Mapping[EpisodeId, str]:
-        return await self.log.append(records, on_wait)
+    async def append(self, *batch: Any, **options: Any) -> Mapping[EpisodeId, str]:
+        return await self.log.append(*batch, **options)
 
     async def confirm(self) -> None:
         """Nothing has to be confirmed."""
@@ -138,10 +137,8 @@ class ForwardingDestination(Destination):
     def __init__(self, destination: Destination) -> None:
         self._destination = destination
 
-    async def append(
-        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
-    ) -> Mapping[EpisodeId, str]:
-        return await self._destination.append(records, on_wait)
+    async def append(self, *batch: Any, **options: Any) -> Mapping[EpisodeId, str]:
+        return await self._destination.append(*batch, **options)
 
     async def confirm(self) -> None:
         await self._destination.confirm()
@@ -158,10 +155,8 @@ class LosesReplies(ForwardingDestination):
 
     lost = False
 
-    async def append(
-        self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
-    ) -> Mapping[EpisodeId, str]:
-        refusals = await super().append(records, on_wait)
+    async def append(self, *batch: Any, **options: Any) -> Mapping[EpisodeId, str]:
+        refusals = await super().append(*batch, **options)
         self.lost = not self.lost
         if self.lost:
             raise DatabaseUnavailable("the connection was closed before the reply came")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import re
 import threading
-from collections.abc import Callable, Iterable
-from contextlib import AbstractAsyncContextManager
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pycrorm_async import Memory
 from pycrorm_async.operations.daemon import serve
@@ -17,7 +17,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.writer.drain import Source
 from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask
-from tests.writer.fakes import opener
+from tests.writer.fakes import KeptSource, opener
 
 # === writer threads ===========================================================================================
 #
@@ -31,24 +31,28 @@ def writers_alive() -> list[str]:
     return [each.name for each in threading.enumerate() if each.name.startswith("pycrorm writer")]
 
 
-def no_writer_alive() -> Iterable[Source]:
-    return ()
-
-
 def writer_for(
     source: Source,
     address: DatabaseAddress,
     *,
     settings: Settings = NEVER_IDLE,
     adopt: Iterable[Source] = (),
-    busy_timeout_s: float = 5.0,
+    **opening: Any,
 ) -> WriterThread:
+    """Return a writer of this source; `opening` are further arguments of `opener`."""
     return WriterThread(
-        source=source,
-        open_destination=opener(address, busy_timeout_s=busy_timeout_s),
-        adopt=lambda: adopt,
-        settings=settings,
+        source=source, open_destination=opener(address, **opening), adopt=lambda: adopt, settings=settings
     )
+
+
+@asynccontextmanager
+async def writing(source: KeptSource, address: DatabaseAddress, **options: Any) -> AsyncIterator[WriterThread]:
+    """Start a writer, and close it with its source at the end; the options are those of `writer_for`."""
+    writer = writer_for(source, address, **options)
+    await writer.start()
+    yield writer
+    source.close()
+    await writer.close()
 
 
 async def until(holds: Callable[[], bool]) -> None:

@@ -7,6 +7,7 @@ import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -48,11 +49,9 @@ async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next
     seen: list[str] = []
 
     class NotingLog(ForwardingDestination):
-        async def append(
-            self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
-        ) -> Mapping[EpisodeId, str]:
-            seen.append(f"append to {records[-1].position} with {source.acknowledgements} acknowledged")
-            return await super().append(records, on_wait)
+        async def append(self, *batch: Any, **options: Any) -> Mapping[EpisodeId, str]:
+            seen.append(f"append to {batch[0][-1].position} with {source.acknowledgements} acknowledged")
+            return await super().append(*batch, **options)
 
     class NotingSource(KeptSource):
         async def acknowledge(self, position: int) -> None:
@@ -79,7 +78,7 @@ class StoringLog(ForwardingDestination):
         for _ in range(2):
             on_wait()
             await asyncio.sleep(0)
-        return await super().append(records, on_wait)
+        return await super().append(records)
 
 
 async def test_the_next_batch_is_read_once_while_a_server_stores_this_one(log: EventLog) -> None:
@@ -314,7 +313,7 @@ class PausingLog(ForwardingDestination):
     ) -> Mapping[EpisodeId, str]:
         on_wait()
         await self._points.pause_at("before append")
-        refusals = await super().append(records, on_wait)
+        refusals = await super().append(records)
         await self._points.pause_at("after append")
         return refusals
 

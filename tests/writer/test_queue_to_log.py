@@ -25,7 +25,7 @@ from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask, ask_to_change
 from tests.store.factories import episode, name, record, run_of
 from tests.writer.fakes import CountingFold, KeptSource, opener
-from tests.writer.running_writers import QUICK, until, until_answer, writer_for, writers_alive
+from tests.writer.running_writers import QUICK, until, until_answer, writer_for, writers_alive, writing
 
 # === queue to log =============================================================================================
 #
@@ -219,12 +219,11 @@ async def test_a_contradiction_between_a_dead_recorder_and_the_log_is_reported_o
     await log.append([record(episode(2), 1, payload=b'{"other":1}')])
     await log.close()
     source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=[KeptSource(run_of(episode(2), 1, 4), closed=True, name="dead 2")])
-    await writer.start()
-    await until(lambda: bool(writer.state.adoption_errors))
-    await writer.flush(3)
-    source.close()
-    await writer.close()
+    async with writing(
+        source, address, adopt=[KeptSource(run_of(episode(2), 1, 4), closed=True, name="dead 2")]
+    ) as writer:
+        await until(lambda: bool(writer.state.adoption_errors))
+        await writer.flush(3)
     [line] = [each.getMessage() for each in caplog.records]
     assert line == (f"recorder dead 2: episode {name(2)}, event 1: another event is stored under this number already")
 
@@ -262,11 +261,8 @@ async def test_closing_does_not_wait_for_the_records_of_other_recorders(address:
 
     folders = open_sources()
     source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=folders)
-    await writer.start()
-    await until_answer(address.path, "SELECT count(*) FROM event", [(8,)])
-    source.close()
-    await writer.close()
+    async with writing(source, address, adopt=folders):
+        await until_answer(address.path, "SELECT count(*) FROM event", [(8,)])
     assert writers_alive() == []
     assert release_folder == ["never closed"]
     assert ask(address.path, "SELECT id, folded FROM episode ORDER BY id") == [(name(1), 3), (name(2), 5)]

@@ -6,12 +6,12 @@ import asyncio
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
 
 import pytest
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, EpisodeParked, FlushTimeout, LogDamaged
-from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
@@ -20,15 +20,15 @@ from pycrorm_async.writer.drain import Destination
 from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask
 from tests.store.factories import declaration, episode, name, record, run_of
-from tests.writer.fakes import ForwardingDestination, KeptSource, opener
+from tests.writer.fakes import ForwardingDestination, KeptSource
 from tests.writer.running_writers import (
     NEVER_IDLE,
     QUICK,
-    no_writer_alive,
     until,
     until_answer,
     writer_for,
     writers_alive,
+    writing,
 )
 
 HEADS = "SELECT id, head, folded FROM episode ORDER BY number"
@@ -36,15 +36,12 @@ HEADS = "SELECT id, head, folded FROM episode ORDER BY number"
 
 async def test_records_put_before_a_flush_are_stored_and_folded_after_it(address: DatabaseAddress) -> None:
     source = KeptSource()
-    writer = writer_for(source, address)
-    await writer.start()
-    source.put([declaration(b"{}"), *run_of(episode(1), 1, 2500, position=2)])
-    await writer.flush(2501)
-    assert ask(address.path, HEADS) == [(name(1), 2500, 2500)]
-    assert source.kept == []
-    source.put(run_of(episode(1), 2501, 2600, position=2502))
-    source.close()
-    await writer.close()
+    async with writing(source, address) as writer:
+        source.put([declaration(b"{}"), *run_of(episode(1), 1, 2500, position=2)])
+        await writer.flush(2501)
+        assert ask(address.path, HEADS) == [(name(1), 2500, 2500)]
+        assert source.kept == []
+        source.put(run_of(episode(1), 2501, 2600, position=2502))
     assert ask(address.path, HEADS) == [(name(1), 2600, 2600)]
     assert source.kept == []
     assert writers_alive() == []
@@ -53,33 +50,27 @@ async def test_records_put_before_a_flush_are_stored_and_folded_after_it(address
 @pytest.mark.slow
 async def test_events_are_stored_beside_a_plan_that_never_suspends(address: DatabaseAddress) -> None:
     source = KeptSource()
-    writer = writer_for(source, address)
-    await writer.start()
-    patience_ends = time.monotonic() + 60
-    put = 0
-    while writer.state.queue.records < 5000:  # without an await, so that the loop of the plan never runs
-        assert time.monotonic() < patience_ends
-        if put < 20_000:
-            source.put(run_of(episode(1), put + 1, put + 100))
-            put += 100
-        sum(number * number for number in range(1000))
-    await writer.flush(put)
-    source.close()
-    await writer.close()
+    async with writing(source, address) as writer:
+        patience_ends = time.monotonic() + 60
+        put = 0
+        while writer.state.queue.records < 5000:  # without an await, so that the loop of the plan never runs
+            assert time.monotonic() < patience_ends
+            if put < 20_000:
+                source.put(run_of(episode(1), put + 1, put + 100))
+                put += 100
+            sum(number * number for number in range(1000))
+        await writer.flush(put)
     assert ask(address.path, HEADS) == [(name(1), put, put)]
     assert ask(address.path, "SELECT count(*), max(sequence) FROM event") == [(put, put)]
 
 
 async def test_events_of_an_idle_plan_are_folded_without_a_flush(address: DatabaseAddress) -> None:
     source = KeptSource()
-    writer = writer_for(source, address, settings=QUICK)
-    await writer.start()
-    source.put(run_of(episode(1), 1, 100))
-    await until_answer(address.path, HEADS, [(name(1), 100, 100)])
-    source.put(run_of(episode(1), 101, 150))
-    await until_answer(address.path, HEADS, [(name(1), 150, 150)])
-    source.close()
-    await writer.close()
+    async with writing(source, address, settings=QUICK):
+        source.put(run_of(episode(1), 1, 100))
+        await until_answer(address.path, HEADS, [(name(1), 100, 100)])
+        source.put(run_of(episode(1), 101, 150))
+        await until_answer(address.path, HEADS, [(name(1), 150, 150)])
 
 
 async def test_events_left_unfolded_by_a_predecessor_are_folded_when_the_new_plan_is_idle(
@@ -89,11 +80,8 @@ async def test_events_left_unfolded_by_a_predecessor_are_folded_when_the_new_pla
     await log.append(run_of(episode(1), 1, 7))
     await log.close()
     source = KeptSource()
-    writer = writer_for(source, address, settings=QUICK)
-    await writer.start()
-    await until_answer(address.path, HEADS, [(name(1), 7, 7)])
-    source.close()
-    await writer.close()
+    async with writing(source, address, settings=QUICK):
+        await until_answer(address.path, HEADS, [(name(1), 7, 7)])
 
 
 # --- opening --------------------------------------------------------------------------------------------------
@@ -167,11 +155,8 @@ async def test_an_episode_that_was_parked_before_is_not_raised_again(address: Da
         await park(connection, 1, "an old story")
     await log.close()
     source = KeptSource(run_of(episode(2), 1, 3))
-    writer = writer_for(source, address)
-    await writer.start()
-    await writer.flush(3)
-    source.close()
-    await writer.close()
+    async with writing(source, address) as writer:
+        await writer.flush(3)
     assert ask(address.path, HEADS) == [(name(1), 3, 0), (name(2), 3, 3)]
 
 
@@ -206,9 +191,7 @@ async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) ->
             raise KeyError("no such column")
 
     source = KeptSource()
-    writer = WriterThread(
-        source=source, open_destination=opener(address, around=Unfoldable), adopt=no_writer_alive, settings=QUICK
-    )
+    writer = writer_for(source, address, around=Unfoldable, settings=QUICK)
     await writer.start()
     source.put(run_of(episode(1), 1, 5))
     await until(lambda: writer.state.fold_error is not None)
@@ -240,45 +223,30 @@ async def test_a_fold_on_an_unavailable_database_is_retried(address: DatabaseAdd
             return await super().stopped()
 
     source = KeptSource(run_of(episode(1), 1, 5))
-    writer = WriterThread(
-        source=source,
-        open_destination=opener(address, around=OftenUnavailable),
-        adopt=no_writer_alive,
-        settings=NEVER_IDLE,
-    )
-    await writer.start()
-    await writer.flush(5)
-    assert ask(address.path, HEADS) == [(name(1), 5, 5)]
-    assert writer.state.fold_error is None
-    source.close()
-    await writer.close()
+    async with writing(source, address, around=OftenUnavailable, settings=NEVER_IDLE) as writer:
+        await writer.flush(5)
+        assert ask(address.path, HEADS) == [(name(1), 5, 5)]
+        assert writer.state.fold_error is None
 
 
 async def test_a_cancelled_flush_stops_the_wait_and_not_the_work(address: DatabaseAddress) -> None:
     entered, release = threading.Event(), threading.Event()
 
     class Slow(ForwardingDestination):
-        async def append(
-            self, records: Sequence[Record], on_wait: Callable[[], None] = lambda: None
-        ) -> Mapping[EpisodeId, str]:
+        async def append(self, *batch: Any, **options: Any) -> Mapping[EpisodeId, str]:
             entered.set()
             await asyncio.to_thread(release.wait)
-            return await super().append(records, on_wait)
+            return await super().append(*batch, **options)
 
     source = KeptSource(run_of(episode(1), 1, 5))
-    writer = WriterThread(
-        source=source, open_destination=opener(address, around=Slow), adopt=no_writer_alive, settings=NEVER_IDLE
-    )
-    await writer.start()
-    flushing = asyncio.create_task(writer.flush(5))
-    await asyncio.to_thread(entered.wait)
-    flushing.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await flushing
-    release.set()
-    await until_answer(address.path, HEADS, [(name(1), 5, 5)])
-    source.close()
-    await writer.close()
+    async with writing(source, address, around=Slow, settings=NEVER_IDLE) as writer:
+        flushing = asyncio.create_task(writer.flush(5))
+        await asyncio.to_thread(entered.wait)
+        flushing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await flushing
+        release.set()
+        await until_answer(address.path, HEADS, [(name(1), 5, 5)])
 
 
 async def test_the_database_is_closed_in_the_loop_that_opened_it(address: DatabaseAddress) -> None:
@@ -289,8 +257,8 @@ async def test_the_database_is_closed_in_the_loop_that_opened_it(address: Databa
         return destination
 
     source = KeptSource()
-    opened = opener(address, around=around, closed=lambda: threads.append(threading.current_thread().name))
-    writer = WriterThread(source=source, open_destination=opened, adopt=no_writer_alive, settings=NEVER_IDLE)
+    closed = lambda: threads.append(threading.current_thread().name)  # noqa: E731
+    writer = writer_for(source, address, around=around, closed=closed)
     await writer.start()
     source.close()
     await writer.close()
@@ -331,9 +299,7 @@ async def test_a_failing_query_for_stopped_episodes_is_reported_once_and_raised_
 
     source = KeptSource(run_of(episode(1), 1, 5))
     settings = Settings(flush_timeout_s=1000.0)
-    writer = WriterThread(
-        source=source, open_destination=opener(address, around=Unreadable), adopt=no_writer_alive, settings=settings
-    )
+    writer = writer_for(source, address, around=Unreadable, settings=settings)
     await writer.start()
     async with asyncio.timeout(30):
         with pytest.raises(KeyError, match="no such column"):
@@ -389,9 +355,7 @@ async def test_a_flush_that_closing_stops_waiting_for_reports_that(address: Data
 
     source = KeptSource(run_of(episode(1), 1, 5))
     settings = Settings(idle_ms=10**9, flush_timeout_s=3.0)
-    writer = WriterThread(
-        source=source, open_destination=opener(address, around=Endless), adopt=no_writer_alive, settings=settings
-    )
+    writer = writer_for(source, address, around=Endless, settings=settings)
     await writer.start()
     source.close()
     closing = asyncio.create_task(writer.close())
