@@ -28,15 +28,6 @@ from pycrorm_async.queue.sync_thread import SyncThread
 from pycrorm_async.settings import Settings
 from tests.queue.factories import SMALL, ended, episode, make, node, record, started
 
-SLOW = Settings(
-    sync_interval_ms=3_600_000,
-    segment_bytes=SMALL.segment_bytes,
-    spool_bytes_max=SMALL.spool_bytes_max,
-    spool_reserve_bytes=SMALL.spool_reserve_bytes,
-    record_bytes_max=SMALL.record_bytes_max,
-)
-
-
 ON_A_SMALL_DISK = Settings(
     sync_interval_ms=5, segment_bytes=2**15, spool_bytes_max=2**30, spool_reserve_bytes=2**16, record_bytes_max=2**12
 )

@@ -24,7 +24,6 @@ from pycrorm_async.queue.format import EVENT, Segment, salt_of, sync_path
 from pycrorm_async.settings import Settings
 from tests.crash.disk_machine import (
     ON_A_SMALL_DISK,
-    SLOW,
     Machine,
     break_next_sync,
     disk_of_256_kib,
@@ -33,6 +32,7 @@ from tests.crash.disk_machine import (
 )
 from tests.queue.factories import (
     RECORDER,
+    SLOW,
     drain,
     ended,
     eventually,

@@ -7,7 +7,7 @@ import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.queue import RecorderQueue
-from tests.queue.factories import FolderWriter, make
+from tests.queue.factories import SLOW, FolderWriter, make
 
 
 @pytest.fixture
@@ -18,6 +18,14 @@ def spool(tmp_path: Path) -> Path:
 @pytest.fixture
 def queue(spool: Path) -> Iterator[RecorderQueue]:
     queue = make(spool)
+    yield queue
+    queue.release()
+
+
+@pytest.fixture
+def unsynced(spool: Path) -> Iterator[RecorderQueue]:
+    """Return a queue that syncs only when it is asked to."""
+    queue = make(spool, settings=SLOW)
     yield queue
     queue.release()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 
@@ -30,6 +31,9 @@ SMALL = Settings(
     spool_reserve_bytes=2 * 4096,
     record_bytes_max=2048,
 )
+
+SLOW = replace(SMALL, sync_interval_ms=3_600_000)
+"""The queue syncs only when it is asked to."""
 
 # Every node takes 976 bytes. The first segment holds the start and 3 nodes, each other segment 3: 24 in 8 segments. The
 # reserve is 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, which hold 3 nodes.

@@ -56,7 +56,7 @@ def bound(spool: Path) -> Path:
 
 
 async def test_a_blob_is_on_the_disk_before_the_commit_frame_of_the_record_that_refers_to_it(
-    spool: Path, monkeypatch: pytest.MonkeyPatch
+    unsynced: RecorderQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
     fsync, append_commit = os.fsync, Segment.sync
@@ -69,17 +69,15 @@ async def test_a_blob_is_on_the_disk_before_the_commit_frame_of_the_record_that_
         append_commit(segment)
         order.append("segment")
 
-    queue = make(spool, settings=replace(SMALL, sync_interval_ms=60_000))
     monkeypatch.setattr(os, "fsync", watched_fsync)
     monkeypatch.setattr(Segment, "sync", watched_sync)
-    queue.put_nowait(started(), b"{}")
-    put_referring(queue)
+    unsynced.put_nowait(started(), b"{}")
+    put_referring(unsynced)
     assert NAME not in order, "the plan's thread must not wait for the disk"
-    await queue.synced_to()
+    await unsynced.synced_to()
     last_sync = len(order) - 1 - order[::-1].index("segment")
     assert order.index(NAME) < last_sync
     assert order.index("blobs") < last_sync
-    queue.release()
 
 
 async def test_equal_contents_are_one_file_and_release_frees_their_space(bound: Path) -> None:
@@ -149,8 +147,9 @@ async def test_kept_blobs_count_and_are_deleted_with_their_segment(bound: Path) 
     assert read_blob(bound, name) is None
 
 
-def test_a_blob_that_does_not_fit_beside_the_reserve_is_refused_at_once_and_leaves_no_file(spool: Path) -> None:
-    queue = make(spool)  # eight segments of 4,096 bytes, two of them reserved
+def test_a_blob_that_does_not_fit_beside_the_reserve_is_refused_at_once_and_leaves_no_file(
+    queue: RecorderQueue,
+) -> None:
     queue.put_nowait(started(), b"{}")
     with pytest.raises(SpoolFull, match="spool_bytes_max is reached"):
         queue.put_blob(bytes(6 * 4096))
@@ -162,12 +161,9 @@ def test_a_blob_that_does_not_fit_beside_the_reserve_is_refused_at_once_and_leav
             queue.put_nowait(node(), b"n" * 900)
     segments = queue._appender.begun
     assert (len(segments) + 3) * 4096 <= SMALL.spool_bytes_max
-    queue.put_nowait(ended(), b"{}", reserved=True)
-    queue.release()
 
 
-def test_a_full_disk_refuses_a_blob_and_nothing_else(spool: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    queue = make(spool)
+def test_a_full_disk_refuses_a_blob_and_nothing_else(queue: RecorderQueue, monkeypatch: pytest.MonkeyPatch) -> None:
     queue.put_nowait(started(), b"{}")
 
     def full(descriptor: int, offset: int, size: int) -> None:
@@ -180,16 +176,12 @@ def test_a_full_disk_refuses_a_blob_and_nothing_else(spool: Path, monkeypatch: p
     assert list((queue.folder / "blobs").iterdir()) == []
     assert queue._appender.blob_bytes == 0
     put_referring(queue)
-    queue.put_nowait(ended(), b"{}")
-    queue.release()
 
 
-def test_a_closed_queue_refuses_blobs(spool: Path) -> None:
-    queue = make(spool)
+def test_a_closed_queue_refuses_blobs(queue: RecorderQueue) -> None:
     queue.close()
     with pytest.raises(SpoolClosed):
         queue.put_blob(IMAGE)
-    queue.release()
 
 
 async def test_a_killed_recorders_blobs_are_kept_with_its_last_segment(bound: Path, tmp_path: Path) -> None:
@@ -211,15 +203,14 @@ async def test_a_killed_recorders_blobs_are_kept_with_its_last_segment(bound: Pa
 
 @pytest.mark.parametrize("spoiled", ["missing", "empty", "zeros", "none"])
 async def test_an_unsynced_record_whose_blob_a_power_cut_took_belongs_to_the_torn_tail(
-    spool: Path, tmp_path: Path, spoiled: str
+    unsynced: RecorderQueue, tmp_path: Path, spoiled: str
 ) -> None:
-    queue = make(spool, settings=replace(SMALL, sync_interval_ms=60_000))
-    queue.put_nowait(started(), b"{}")
-    await queue.synced_to()
-    queue.put_nowait(node(), b"{}")
-    put_referring(queue)
-    queue.put_nowait(node(), b"{}")
-    left = crashed_copy(queue, tmp_path / "left")
+    unsynced.put_nowait(started(), b"{}")
+    await unsynced.synced_to()
+    unsynced.put_nowait(node(), b"{}")
+    put_referring(unsynced)
+    unsynced.put_nowait(node(), b"{}")
+    left = crashed_copy(unsynced, tmp_path / "left")
     blob = left / "blobs" / NAME
     if spoiled == "missing":
         blob.unlink()
@@ -234,35 +225,28 @@ async def test_an_unsynced_record_whose_blob_a_power_cut_took_belongs_to_the_tor
     whole = ["EpisodeStarted", "NodeStarted", "Observed", "NodeStarted", "EpisodeEnded"]
     assert types == (whole if spoiled == "none" else ["EpisodeStarted", "NodeStarted", "EpisodeEnded"])
     assert (left / "00000001.segment.tail").exists() is (spoiled != "none")
-    queue.put_nowait(ended(), b"{}")
-    queue.release()
 
 
-async def test_a_synced_record_stays_although_its_blob_was_deleted(spool: Path, tmp_path: Path) -> None:
-    queue = make(spool, settings=replace(SMALL, sync_interval_ms=60_000))
-    queue.put_nowait(started(), b"{}")
-    put_referring(queue)
-    await queue.synced_to()
-    left = crashed_copy(queue, tmp_path / "left")
+async def test_a_synced_record_stays_although_its_blob_was_deleted(unsynced: RecorderQueue, tmp_path: Path) -> None:
+    unsynced.put_nowait(started(), b"{}")
+    put_referring(unsynced)
+    await unsynced.synced_to()
+    left = crashed_copy(unsynced, tmp_path / "left")
     (left / "blobs" / NAME).unlink()
     source = open_dead(left)
     assert source is not None
     assert [each.type for each in await drain(source)] == ["EpisodeStarted", "Observed", "EpisodeEnded"]
     source.release()
-    queue.put_nowait(ended(), b"{}")
-    queue.release()
 
 
-async def test_a_blob_that_is_deleted_before_its_sync_ends_the_queue(spool: Path) -> None:
-    queue = make(spool, settings=replace(SMALL, sync_interval_ms=60_000))
-    queue.put_nowait(started(), b"{}")
-    await queue.synced_to()
-    put_referring(queue)
-    (queue.folder / "blobs" / NAME).unlink()
+async def test_a_blob_that_is_deleted_before_its_sync_ends_the_queue(unsynced: RecorderQueue) -> None:
+    unsynced.put_nowait(started(), b"{}")
+    await unsynced.synced_to()
+    put_referring(unsynced)
+    (unsynced.folder / "blobs" / NAME).unlink()
     with pytest.raises(SpoolUnavailable, match="No such file"):
-        await queue.synced_to()
-    assert queue.synced == 1
-    queue.release()
+        await unsynced.synced_to()
+    assert unsynced.synced == 1
 
 
 async def test_a_repaired_folder_and_the_damaged_one_both_have_the_blobs(spool: Path, tmp_path: Path) -> None:
@@ -280,8 +264,7 @@ async def test_a_repaired_folder_and_the_damaged_one_both_have_the_blobs(spool: 
     assert (Path(report.set_aside) / "blobs" / NAME).read_bytes() == IMAGE
 
 
-async def test_a_report_counts_blobs_and_finds_nothing_foreign(spool: Path) -> None:
-    queue = make(spool)
+async def test_a_report_counts_blobs_and_finds_nothing_foreign(queue: RecorderQueue, spool: Path) -> None:
     Spool(spool).bind("a-log")
     queue.put_nowait(started(), b"{}")
     before = inspect_spool(spool).recorders[0].bytes_spooled
@@ -290,5 +273,3 @@ async def test_a_report_counts_blobs_and_finds_nothing_foreign(spool: Path) -> N
     assert recorder.foreign == ()
     assert recorder.blobs == 1
     assert recorder.bytes_spooled == before + len(IMAGE)
-    queue.put_nowait(ended(), b"{}")
-    queue.release()

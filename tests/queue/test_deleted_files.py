@@ -11,8 +11,7 @@ import pytest
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from tests.crash.disk_machine import SLOW
-from tests.queue.factories import make, node, started
+from tests.queue.factories import SLOW, make, node, started
 
 GONE = "was deleted or replaced while the queue wrote to it"
 

@@ -105,7 +105,7 @@ async def recovered(folder: Path) -> tuple[list[Record], PycrormError | None]:
         return [], refusal
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", [*range(15), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(15, 60))])
 async def test_a_crafted_folder_is_recovered_or_refused_with_its_file_and_a_repair_makes_it_readable(
     tmp_path: Path, seed: int
 ) -> None:

@@ -1,10 +1,8 @@
 """A full spool: files never exceed the limit, reserved records have their reserve, freed space wakes producers."""
 
 import asyncio
-import contextlib
 import errno
 import os
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +17,6 @@ from pycrorm_async.queue.gc_safe_lock import GcSafeLock
 from pycrorm_async.settings import Settings
 from tests.queue.factories import (
     ALL,
-    DECLARED,
     ORDINARY,
     PAYLOAD,
     SMALL,
@@ -61,38 +58,22 @@ def test_a_refused_record_leaves_no_gap_and_smaller_ones_may_still_fit(filled: R
     with pytest.raises(SpoolFull, match="spool_bytes_max is reached"):
         filled.put_nowait(node(), PAYLOAD)
     assert filled.put_nowait(node(), b"x") == 2 + ORDINARY
+    assert filled.full  # for the refused record
     assert filled.put_nowait(node(), PAYLOAD, reserved=True) == 3 + ORDINARY
 
 
 async def test_space_is_freed_when_records_are_stored_and_segments_deleted(filled: RecorderQueue) -> None:
+    assert fill(filled, reserved=True) == ALL - ORDINARY
     waiting = asyncio.ensure_future(filled.room())
+    blocked = asyncio.ensure_future(asyncio.to_thread(filled.block_until_room, 30.0))
     await asyncio.sleep(0)
     assert not waiting.done()
     await drain_all(filled)
     await asyncio.wait_for(waiting, 10)
+    assert await blocked
     assert not filled.full
-    assert filled.put_nowait(node(), PAYLOAD) == 2 + ORDINARY
+    assert filled.put_nowait(node(), PAYLOAD) == 2 + ALL
     await asyncio.wait_for(filled.room(), 10)
-
-
-async def test_space_for_a_large_record_is_not_announced_while_only_a_small_one_fits(filled: RecorderQueue) -> None:
-    assert filled.put_nowait(node(), b"x") == 2 + ORDINARY
-    assert filled.full  # for the refused record
-
-
-async def test_a_blocked_thread_continues_when_records_are_stored(tmp_path: Path) -> None:
-    queue = make(tmp_path, clock=SYSTEM_CLOCK)
-    queue.put_nowait(started(), b"{}")
-    fill(queue, reserved=True)
-    assert queue.block_until_room(0.01) is False
-    answers: list[bool] = []
-    blocked = threading.Thread(target=lambda: answers.append(queue.block_until_room(30.0)))
-    blocked.start()
-    await drain_all(queue)
-    await asyncio.to_thread(blocked.join)
-    assert answers == [True]
-    assert queue.block_until_room(0.0) is True
-    queue.release()
 
 
 async def test_no_producer_waits_for_space_in_a_closed_queue(filled: RecorderQueue) -> None:
@@ -146,16 +127,6 @@ def test_settings_that_cannot_work_are_refused_before_any_file_is_made(tmp_path:
     with pytest.raises(CallerError, match="three segments"):
         make(tmp_path / "spool", settings=replace(SMALL, spool_reserve_bytes=6 * 4096))
     assert not (tmp_path / "spool").exists()
-
-
-def test_records_without_an_episode_count_too(queue: RecorderQueue) -> None:
-    assert not queue.full
-    put = 0
-    with contextlib.suppress(SpoolFull):
-        while True:
-            put += 1 + queue.put_nowait(DECLARED, PAYLOAD)
-    assert put == ORDINARY
-    assert queue.full
 
 
 def test_a_disk_that_filled_up_while_a_segment_was_prepared_stays_full(
@@ -235,9 +206,3 @@ def test_the_largest_record_fits_beside_sixteen_open_episodes_or_the_settings_ar
     )
     with pytest.raises(CallerError, match="record_bytes_max"):
         Capacity.of(Settings(segment_bytes=2**18))
-
-
-def test_with_the_default_settings_the_limit_on_episodes_is_reached_last() -> None:
-    episodes = (8 * 2**20 - 2 * 72 - 56 - 64 - (2**20 + 256)) // 40
-    assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20, episodes, 2**26 - 1 - 2**20)
-    assert episodes > 180_000

@@ -4,7 +4,6 @@ import asyncio
 import os
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,6 @@ from tests.queue.factories import (
     DECLARED,
     LONG_S,
     RECORDER,
-    SMALL,
     batch_of,
     crashed_copy,
     drain,
@@ -64,15 +62,13 @@ async def test_a_written_record_survives_a_kill_before_any_sync(tmp_path: Path) 
     assert await recover(left) == [record(1, started(), 1, b"{}"), record(2, node(), 2, b"1"), lost(3, 1, 3)]
 
 
-async def test_only_synced_records_are_supplied(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
-    queue.put_nowait(started(), b"{}")
-    waiting = batch_of(queue, 10)
+async def test_only_synced_records_are_supplied(unsynced: RecorderQueue) -> None:
+    unsynced.put_nowait(started(), b"{}")
+    waiting = batch_of(unsynced, 10)
     assert await asyncio.wait({waiting}, timeout=0.05) == (set(), {waiting})
-    await queue.synced_to()
-    assert queue.synced == 1
+    await unsynced.synced_to()
+    assert unsynced.synced == 1
     assert await waiting == [record(1, started(), 1, b"{}")]
-    queue.release()
 
 
 async def test_a_sync_happens_unasked_and_serves_many_waiters_in_several_loops(queue: RecorderQueue) -> None:
@@ -84,18 +80,16 @@ async def test_a_sync_happens_unasked_and_serves_many_waiters_in_several_loops(q
     assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [1, 2]  # no caller requested this sync
 
 
-async def test_a_cancelled_waiter_leaves_the_others_waiting(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
-    queue.put_nowait(started(), b"{}")
-    waiting = batch_of(queue, 1)
-    given_up = batch_of(queue, 1)
+async def test_a_cancelled_waiter_leaves_the_others_waiting(unsynced: RecorderQueue) -> None:
+    unsynced.put_nowait(started(), b"{}")
+    waiting = batch_of(unsynced, 1)
+    given_up = batch_of(unsynced, 1)
     await asyncio.sleep(0)
     given_up.cancel()
     with pytest.raises(asyncio.CancelledError):
         await given_up
-    await queue.synced_to()
+    await unsynced.synced_to()
     assert [each.position for each in await waiting] == [1]
-    queue.release()
 
 
 async def test_sequences_of_many_threads_have_no_gaps_and_no_duplicates(tmp_path: Path) -> None:
@@ -199,17 +193,6 @@ async def steps(count: int) -> None:
         await asyncio.sleep(0)
 
 
-async def test_a_cancelled_batch_is_supplied_again(queue: RecorderQueue) -> None:
-    queue.put_nowait(started(), b"{}")
-    await queue.synced_to()
-    waiting = batch_of(queue, 2, age_s=LONG_S)
-    await asyncio.sleep(0.02)
-    waiting.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await waiting
-    assert [each.position for each in await batch_of(queue, 2)] == [1]
-
-
 async def test_a_consumer_in_its_own_loop_and_thread_is_woken_by_producers(queue: RecorderQueue) -> None:
     async def consume() -> list[int]:
         positions: list[int] = []
@@ -228,18 +211,16 @@ async def test_a_consumer_in_its_own_loop_and_thread_is_woken_by_producers(queue
     assert queue.stored == 21
 
 
-async def test_bytes_spooled_counts_headers_records_and_commits(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=replace(SMALL, sync_interval_ms=3_600_000))
-    assert queue.bytes_spooled == 56
-    queue.put_nowait(started(), b"{}")
-    assert queue.bytes_spooled == 56 + 64 + 16
-    await queue.synced_to()
-    await queue.synced_to()
-    assert queue.bytes_spooled == 56 + 80 + 72
+async def test_bytes_spooled_counts_headers_records_and_commits(unsynced: RecorderQueue) -> None:
+    assert unsynced.bytes_spooled == 56
+    unsynced.put_nowait(started(), b"{}")
+    assert unsynced.bytes_spooled == 56 + 64 + 16
+    await unsynced.synced_to()
+    await unsynced.synced_to()
+    assert unsynced.bytes_spooled == 56 + 80 + 72
     for _ in range(4):
-        queue.put_nowait(node(), b"x" * 900)
-    assert queue.bytes_spooled == 4096 + 96 + 976
-    queue.release()
+        unsynced.put_nowait(node(), b"x" * 900)
+    assert unsynced.bytes_spooled == 4096 + 96 + 976
 
 
 async def test_after_a_sync_as_many_bytes_are_made_writable_as_the_records_before_took(
@@ -263,19 +244,17 @@ async def test_after_a_sync_as_many_bytes_are_made_writable_as_the_records_befor
 # The folder of a live queue: refused at the beginning, drained by one source, closed, and left behind or deleted.
 
 
-async def test_closing_refuses_puts_syncs_drains_and_ends_with_an_empty_batch(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
-    queue.put_nowait(started(), b"{}")
-    queue.put_nowait(node(), b"{}")
-    queue.close()
-    queue.close()
+async def test_closing_refuses_puts_syncs_drains_and_ends_with_an_empty_batch(unsynced: RecorderQueue) -> None:
+    unsynced.put_nowait(started(), b"{}")
+    unsynced.put_nowait(node(), b"{}")
+    unsynced.close()
+    unsynced.close()
     with pytest.raises(SpoolClosed):
-        queue.put_nowait(node(), b"{}")
-    assert [each.position for each in await batch_of(queue, 1)] == [1]
-    assert [each.position for each in await batch_of(queue, 1)] == [2]
-    assert await batch_of(queue, 1) == []
-    assert await batch_of(queue, 1) == []
-    queue.release()
+        unsynced.put_nowait(node(), b"{}")
+    assert [each.position for each in await batch_of(unsynced, 1)] == [1]
+    assert [each.position for each in await batch_of(unsynced, 1)] == [2]
+    assert await batch_of(unsynced, 1) == []
+    assert await batch_of(unsynced, 1) == []
 
 
 async def test_closing_wakes_a_consumer_that_waits_for_a_batch(queue: RecorderQueue) -> None:
@@ -339,23 +318,21 @@ async def test_a_second_recorder_with_the_same_id_is_refused(queue: RecorderQueu
 
 
 async def test_a_record_is_synced_after_one_fdatasync_of_it_and_one_of_its_commit_frame(
-    spool: Path, monkeypatch: pytest.MonkeyPatch
+    unsynced: RecorderQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without either call the list is shorter: no other test of a few milliseconds notices that."""
-    queue = make(spool, settings=replace(SMALL, sync_interval_ms=3_600_000))
     written: list[tuple[list[int], int]] = []
     fdatasync = os.fdatasync
 
     def watched(descriptor: int) -> None:
         content = Path(f"/proc/self/fd/{descriptor}").read_bytes()
         frames = decode_each(content, header_bytes(0), salt_of(RECORDER, 1))
-        written.append(([kind for kind, *_ in frames], queue.synced))
+        written.append(([kind for kind, *_ in frames], unsynced.synced))
         fdatasync(descriptor)
 
     monkeypatch.setattr(os, "fdatasync", watched)
-    queue.put_nowait(started(), b"{}")
-    queue.put_nowait(node(), b"{}")
-    await queue.synced_to()
+    unsynced.put_nowait(started(), b"{}")
+    unsynced.put_nowait(node(), b"{}")
+    await unsynced.synced_to()
     assert written == [([EVENT, EVENT], 0), ([EVENT, EVENT, COMMIT], 0)]
-    assert queue.synced == 2
-    queue.release()
+    assert unsynced.synced == 2

@@ -6,7 +6,7 @@ A daemon claims the folders of the last two: they have the methods of a `Claimed
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -20,7 +20,7 @@ from pycrorm_async.queue.format import EVENT, read_segment, segment_path
 from pycrorm_async.queue.scan import survey
 from pycrorm_async.queue.spool import DrainNote, DrainStatus
 from pycrorm_async.writer.drain import ClaimedSource, Source
-from tests.queue.factories import RECORDER, crashed_copy, ended, fill, make, node, started, take
+from tests.queue.factories import RECORDER, crashed_copy, ended, eventually, fill, make, node, started, take
 
 AnySource = RecorderQueue | LiveSource | DeadSource
 Opened = TypeVar("Opened")
@@ -125,12 +125,6 @@ def dead_letters(spool: Path) -> list[int]:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-async def eventually(reached: Callable[[], bool]) -> None:
-    async with asyncio.timeout(60):
-        while not reached():  # noqa: ASYNC110 - the sync thread sets no event of ours
-            await asyncio.sleep(0.005)
 
 
 async def test_each_synced_record_is_supplied_once_in_order(scene: SourceCase) -> None:

@@ -219,8 +219,7 @@ async def test_each_segment_begins_with_the_declarations_in_use_and_can_be_read_
     ]
 
 
-async def test_a_declaration_without_space_is_recorded_once_and_counted(bound: Path) -> None:
-    queue = make(bound)
+async def test_a_declaration_without_space_is_recorded_once_and_counted(queue: RecorderQueue, bound: Path) -> None:
     for number in range(12):
         queue.put_nowait(DECLARED, b'{"dtype":"%d"}' % number)
     put(queue)
@@ -228,7 +227,6 @@ async def test_a_declaration_without_space_is_recorded_once_and_counted(bound: P
     queue.put_nowait(started(2), b"s" * 2_000)  # the largest record still fits
     queue.close()
     assert len(await drain(queue)) == queue.written
-    queue.release()
 
 
 # === episode numbers ==========================================================================================
