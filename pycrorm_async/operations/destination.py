@@ -37,7 +37,7 @@ from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, WHOLE
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.blobs import read_blob
-from pycrorm_async.queue.format import map_segment, salt_of, segment_numbers, segment_path
+from pycrorm_async.queue.format import map_segment, salt_of, segments_in
 from pycrorm_async.queue.locks import STORED
 from pycrorm_async.queue.scan import SegmentScanner, last_event
 from pycrorm_async.queue.sources import computed_ends
@@ -439,6 +439,6 @@ def stored_heads(spool: Path, log_id: str) -> dict[EpisodeId, int]:
 
 def _segments(folder: Path) -> dict[int, Path]:
     try:
-        return {number: segment_path(folder, number) for number in segment_numbers(folder)}
+        return segments_in(folder)
     except (FileNotFoundError, NotADirectoryError):
         return {}

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 
 from pycrorm_async.errors import EpisodeRefused, FlushTimeout
 from pycrorm_async.events.ids import EpisodeId, is_named
-from pycrorm_async.queue.format import segment_numbers, segment_path
+from pycrorm_async.queue.format import segments_in
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.queue.stored_segments import files_with
@@ -107,8 +107,7 @@ def _holds(folder: Path, episode: EpisodeId) -> bool:
     Its locks do not answer that, because a writer that drains the folder of a dead recorder holds them too.
     """
     with suppress(FileNotFoundError):
-        segments = [segment_path(folder, number) for number in segment_numbers(folder)]
-        return next(files_with(segments, episode), None) is not None
+        return next(files_with(segments_in(folder).values(), episode), None) is not None
     return False
 
 

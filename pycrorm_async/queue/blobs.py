@@ -38,10 +38,10 @@ def blob_files(folder: Path) -> list[Path]:
         return []
 
 
-def blob_bytes(blobs: Iterable[Path]) -> int:
+def file_bytes(files: Iterable[Path]) -> int:
     """Return the size of these files, without those deleted meanwhile."""
     size = 0
-    for each in blobs:
+    for each in files:
         with suppress(FileNotFoundError):
             size += each.stat().st_size
     return size

@@ -116,11 +116,12 @@ def segment_path(folder: Path, number: int) -> Path:
     return folder / f"{number:08d}{SUFFIX}"
 
 
-def segment_numbers(folder: Path) -> list[int]:
-    """Return the numbers of the segments in this folder, in order. Files of other names are ignored."""
+def segments_in(folder: Path) -> dict[int, Path]:
+    """Return the segments in this folder by number, in order. Files of other names are ignored."""
     stems = (path.name.removesuffix(SUFFIX) for path in folder.iterdir() if path.suffix == SUFFIX)
     numbers = ((stem, int(stem)) for stem in stems if stem.isascii() and stem.isdigit())
-    return sorted(number for stem, number in numbers if 0 < number < 2**64 and stem == f"{number:08d}")
+    ours = sorted(number for stem, number in numbers if 0 < number < 2**64 and stem == f"{number:08d}")
+    return {number: segment_path(folder, number) for number in ours}
 
 
 def read_segment(path: Path) -> bytes:

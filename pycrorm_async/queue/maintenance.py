@@ -4,7 +4,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from pathlib import Path
@@ -15,7 +15,7 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue import format as spool_format
 from pycrorm_async.queue import scan
 from pycrorm_async.queue import spool as spools
-from pycrorm_async.queue.blobs import blob_bytes, blob_files
+from pycrorm_async.queue.blobs import blob_files, file_bytes
 from pycrorm_async.queue.locks import ALIVE, BLOBS, DRAIN, MAKING, MENDED, PROGRESS, TAIL, FileLock, is_locked
 
 # === inspection ===============================================================================================
@@ -190,11 +190,13 @@ def inspect_recorder(recorder: spools.RecorderFolder, *, scanning: bool = True) 
 
 
 def _look(recorder: spools.RecorderFolder, report: RecorderReport) -> RecorderReport:
-    blobs = blob_files(recorder.path)
+    blobs, segments = blob_files(recorder.path), list[Path]()
+    with suppress(FileNotFoundError):  # all records were stored and the folder deleted meanwhile
+        segments += spool_format.segments_in(recorder.path).values()
     report = replace(
         report,
         being_drained=is_locked(recorder.path / DRAIN),
-        bytes_spooled=_bytes(recorder.path) + blob_bytes(blobs),
+        bytes_spooled=file_bytes([*segments, *blobs]),
         blobs=len(blobs),
     )
     progress = spools.Progress.open(recorder.path, writing=False) if recorder.alive else None
@@ -204,21 +206,6 @@ def _look(recorder: spools.RecorderFolder, report: RecorderReport) -> RecorderRe
         return replace(report, recorded=progress.recorded(), drained=progress.drained())
     finally:
         progress.close()
-
-
-def _bytes(folder: Path) -> int:
-    try:
-        segments = [spool_format.segment_path(folder, number) for number in spool_format.segment_numbers(folder)]
-    except FileNotFoundError:  # all records were stored and the folder deleted meanwhile
-        return 0
-    return sum(_size(each) for each in segments)
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return 0
 
 
 @dataclass
@@ -244,7 +231,7 @@ def _examine(recorder: spools.RecorderFolder, report: RecorderReport) -> Recorde
     folder = recorder.path
     counted, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or report.being_drained)
     entries = [each.name for each in folder.iterdir()]
-    numbers = {*prefix.numbers, *spool_format.segment_numbers(folder)}  # also those begun or deleted since the scan
+    numbers = {*prefix.numbers, *spool_format.segments_in(folder)}  # also those begun or deleted since the scan
     ours = {ALIVE, BLOBS, DRAIN, PROGRESS, *(spool_format.segment_path(folder, number).name for number in numbers)}
     others = sorted(_text(each) for each in entries if each not in ours)
     return replace(
@@ -253,7 +240,7 @@ def _examine(recorder: spools.RecorderFolder, report: RecorderReport) -> Recorde
         last=prefix.cut.position,
         safe=max(counted.safe, prefix.start.position),
         segments=tuple(
-            SegmentReport(path.name, _size(path), prefix.bases.get(number), counted.segments[number])
+            SegmentReport(path.name, file_bytes([path]), prefix.bases.get(number), counted.segments[number])
             for number in prefix.numbers
             for path in [spool_format.segment_path(folder, number)]
         ),

@@ -124,8 +124,9 @@ class SegmentScanner:
         self._on_frame = on_frame
         self._records = records
         self._types: dict[bytes, str] = {}
-        self._paths = segments
-        self._numbers = spool_format.segment_numbers(folder) if segments is None else sorted(segments)
+        self._is_whole_folder = segments is None
+        self._paths = spool_format.segments_in(folder) if segments is None else segments
+        self._numbers = sorted(self._paths)
         self._steps = 0
         self._start = self._cut = spool_format.ReadCursor(0, 0, 0)
         self._bases: dict[int, int] = {}
@@ -152,7 +153,7 @@ class SegmentScanner:
             if self._steps < len(self._numbers) and (yield from self._scan_segment(self._numbers[self._steps])):
                 self._steps += 1
                 return
-            if self._paths is None:
+            if self._is_whole_folder:
                 _refuse_damage(self._folder, self._recorder, self.prefix)
         except SpoolDamaged as damage:
             self.damage = damage
@@ -187,7 +188,7 @@ class SegmentScanner:
 
     def _scan_segment(self, number: int) -> Generator[None, None, bool]:
         """Scan one segment in parts; return False if it does not continue the one before."""
-        path = spool_format.segment_path(self._folder, number) if self._paths is None else self._paths[number]
+        path = self._paths[number]
         buffer = spool_format.read_segment(path)
         header = read_header(path, buffer, recorder=self._recorder, number=number)
         if not self._bases:
@@ -457,8 +458,7 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
 def _all_committed(folder: Path, recorder: bytes) -> bool:
     """Return whether a commit frame covers the last whole record, so that the folder need not be surveyed."""
     committed = 0
-    for number in reversed(spool_format.segment_numbers(folder)):
-        path = spool_format.segment_path(folder, number)
+    for number, path in reversed(spool_format.segments_in(folder).items()):
         if not spool_format.is_begun(path):
             continue
         buffer = spool_format.read_segment(path)

@@ -616,8 +616,7 @@ class LiveSource:
     def _start_of(self, visible: int) -> spool_format.ReadCursor:
         """Return the beginning of the segment with the record behind this position, or of the oldest segment."""
         start: spool_format.ReadCursor | None = None
-        for number in spool_format.segment_numbers(self.folder):
-            path = spool_format.segment_path(self.folder, number)
+        for number, path in spool_format.segments_in(self.folder).items():
             with spool_format.map_segment(path) as buffer:
                 header = scan.read_header(path, buffer, recorder=self._recorder, number=number)
             if header is None or (start is not None and header.base - 1 > visible):

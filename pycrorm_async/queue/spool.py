@@ -39,7 +39,7 @@ import msgspec
 from pycrorm_async.errors import PycrormError, SpoolForeign, SpoolTaken, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.queue import locks
-from pycrorm_async.queue.format import segment_numbers, segment_path, sync_path
+from pycrorm_async.queue.format import segments_in, sync_path
 from pycrorm_async.settings import FileAccess
 
 BINDING: Final = "log"
@@ -277,8 +277,8 @@ def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[P
 def remove_folder(folder: Path) -> None:
     """Delete our files in the folder, and the folder unless it contains files of others. Raises `OSError`."""
     remove_made_ahead(folder)
-    for number in segment_numbers(folder):  # the oldest first
-        segment_path(folder, number).unlink()
+    for path in segments_in(folder).values():  # the oldest first
+        path.unlink()
     with suppress(FileNotFoundError):
         shutil.rmtree(folder / locks.BLOBS)
     for path in list(folder.iterdir()):
@@ -295,14 +295,11 @@ def remove_made_ahead(folder: Path) -> None:
 
     Call this before deleting segments in use: if a kill left only a preallocated one, its header would seem lost.
     """
-    for path in [segment_path(folder, number) for number in segment_numbers(folder)]:
-        if not _is_begun(path):
+    for path in segments_in(folder).values():
+        with path.open("rb") as file:
+            is_begun = file.read(1) != b"\0"
+        if not is_begun:
             path.unlink()
-
-
-def _is_begun(segment: Path) -> bool:
-    with segment.open("rb") as file:
-        return file.read(1) != b"\0"
 
 
 def write_durably(path: Path, content: bytes) -> None:

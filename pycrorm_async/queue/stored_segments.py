@@ -23,8 +23,8 @@ from zlib import crc32
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
-from pycrorm_async.queue.blobs import blob_bytes, kept_with, rounded
-from pycrorm_async.queue.format import segment_numbers, segment_path
+from pycrorm_async.queue.blobs import file_bytes, kept_with, rounded
+from pycrorm_async.queue.format import segments_in
 from pycrorm_async.queue.locks import NUMBERS, STORED, create_folders, open_file
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.settings import Settings
@@ -73,8 +73,7 @@ def _children(folder: Path) -> list[Path]:
 def _segments(folder: Path) -> Iterator[KeptSegment]:
     after_ns = 0
     with suppress(FileNotFoundError):
-        for number in segment_numbers(folder):
-            path = segment_path(folder, number)
+        for path in segments_in(folder).values():
             with suppress(FileNotFoundError):
                 status = path.stat()
                 after_ns = max(after_ns, status.st_mtime_ns)  # keeps the order by number if the clock was set back
@@ -83,7 +82,7 @@ def _segments(folder: Path) -> Iterator[KeptSegment]:
 
 def _blob_bytes(segment: Path) -> int:
     blobs = kept_with(segment)
-    return sum(rounded(blob_bytes([each])) for each in blobs.iterdir()) if blobs.is_dir() else 0
+    return sum(rounded(file_bytes([each])) for each in blobs.iterdir()) if blobs.is_dir() else 0
 
 
 class StoredSegments:
@@ -195,9 +194,9 @@ def forget_stored(spool: Path, episodes: Iterable[EpisodeId]) -> dict[EpisodeId,
     held: dict[EpisodeId, list[Path]] = {}
     for episode in episodes:
         for folder in [folder for log in _children(spool / STORED) for folder in _children(log)]:
-            segments = [segment_path(folder, number) for number in segment_numbers(folder)]
-            last = max(files_with(segments, episode), default=None)
-            for each in segments:
+            segments = segments_in(folder)
+            last = max(files_with(segments.values(), episode), default=None)
+            for each in segments.values():
                 if last is not None and each <= last:
                     _delete(each)
         if held_in := [*files_with(sorted(spool.rglob("*")), episode)]:

@@ -344,26 +344,19 @@ class Availability:
         try:
             result = await call
         except errors.DatabaseUnavailable as error:
-            self._note_failure(called_s, str(error))
+            if self._unanswered_since_s is None:
+                self._unanswered_since_s = called_s
+            if not self._reported and self._now_s() - self._unanswered_since_s >= _NOTABLE_S:
+                self._reported = True
+                self._on_lost(str(error))
             raise
-        self._note_success(called_s)
-        return result
-
-    def _note_failure(self, called_s: float, reason: str) -> None:
-        if self._unanswered_since_s is None:
-            self._unanswered_since_s = called_s
-        if not self._reported and self._now_s() - self._unanswered_since_s >= _NOTABLE_S:
-            self._reported = True
-            self._on_lost(reason)
-
-    def _note_success(self, called_s: float) -> None:
         since_s = self._unanswered_since_s
-        if since_s is None or called_s < since_s:  # the call began before the database became unavailable
-            return
-        self._unanswered_since_s = None
-        if self._reported:
-            self._reported = False
-            self._on_back(self._now_s() - since_s)
+        if since_s is not None and called_s >= since_s:  # else it was called before the database became unavailable
+            self._unanswered_since_s = None
+            if self._reported:
+                self._reported = False
+                self._on_back(self._now_s() - since_s)
+        return result
 
 
 # === visibility ===============================================================================================

@@ -14,7 +14,7 @@ from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.format import CHECKSUM, EVENT, Frame, encode, salt_of, segment_numbers
+from pycrorm_async.queue.format import CHECKSUM, EVENT, Frame, encode, salt_of, segments_in
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.maintenance import repair_folder
 from pycrorm_async.queue.scan import scan, seal, sync_segments, tails
@@ -453,9 +453,9 @@ async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(sp
         await recovered.acknowledge(batch[-1].position)
         begun = sum(path in {place[0] for place in author.places[len(records) :]} for path in author.segments)
         # Each file is deleted when the next one is in order and nothing in the file is needed; the last file stays.
-        assert max(1, begun) <= len(segment_numbers(author.folder)) <= max(1, begun) + 1
+        assert max(1, begun) <= len(segments_in(author.folder)) <= max(1, begun) + 1
         if events_max == 1 and len(records) == 10:
-            assert (len(segment_numbers(author.folder)) < SEGMENTS, recovered.lost) == (True, ())
+            assert (len(segments_in(author.folder)) < SEGMENTS, recovered.lost) == (True, ())
     assert records == [*author.records, lost(RECORDS + 1, 1, RECORDS + 1)]
     assert recovered.lost == (records[-1],)
     assert recovered.all_stored
@@ -523,7 +523,7 @@ async def test_a_damaged_header_costs_nothing_although_the_files_before_it_were_
     overwrite(author.segments[number - 1], 60, b"#")
     supplied = await supplied_before_damage(author.folder, events_max=2)
     assert supplied == author.records[: len(supplied)]
-    assert len(segment_numbers(author.folder)) <= SEGMENTS - max(0, number - 3)
+    assert len(segments_in(author.folder)) <= SEGMENTS - max(0, number - 3)
     report = repair_folder(author.folder)
     assert report is not None
     assert report.complete

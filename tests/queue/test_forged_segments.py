@@ -20,7 +20,7 @@ from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.appender import Capacity
-from pycrorm_async.queue.format import EVENT, SEGMENT_BYTES_MAX, Frame, encode, read_segment, salt_of, segment_numbers
+from pycrorm_async.queue.format import EVENT, SEGMENT_BYTES_MAX, Frame, encode, read_segment, salt_of, segments_in
 from pycrorm_async.queue.maintenance import inspect_recorder, inspect_spool, repair_folder
 from pycrorm_async.queue.scan import scan
 from tests.queue.factories import (
@@ -182,7 +182,7 @@ async def test_segment_numbers_out_of_range_are_foreign_files(tmp_path: Path) ->
     author = journal(tmp_path)
     for stem in ("0" * 8, "9" * 40, "000000001", "\N{ARABIC-INDIC DIGIT ONE}" * 8):
         (author.folder / f"{stem}.segment").write_bytes(b"x")
-    assert segment_numbers(author.folder) == [int(path.name[:8]) for path in author.segments]
+    assert list(segments_in(author.folder)) == [int(path.name[:8]) for path in author.segments]
     assert [each for each in await recover(author.folder) if each.payload != LOST] == author.records
     with pytest.raises(FileNotFoundError):
         read_segment(author.folder / "gone")

@@ -15,7 +15,7 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.format import segment_numbers, segment_path
+from pycrorm_async.queue.format import segment_path, segments_in
 from pycrorm_async.queue.locks import ALIVE, FileLock
 from pycrorm_async.queue.spool import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
@@ -161,7 +161,7 @@ async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage
     await queue.synced_to()
     folder = crashed_copy(queue, tmp_path / "other")  # no recorder deletes anything here by itself
     queue.release()
-    alive, numbers = FileLock.take(folder / ALIVE), segment_numbers(folder)
+    alive, numbers = FileLock.take(folder / ALIVE), list(segments_in(folder))
     assert alive is not None
     assert len(numbers) > 4
 
