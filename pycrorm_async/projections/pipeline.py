@@ -655,39 +655,29 @@ class LiveTarget:
         return f"event {sequence} is missing in the log"
 
 
+@dataclass(slots=True)
 class SideTarget:
     """A generation with its own checkpoint table.
 
-    Args:
+    Attributes:
         log: with the events.
         key: of its row in `pycrorm_generation`.
         projection: the custom projection's name; None for the built-in tables.
         version: of the fold in this process.
         number: of the generation; None accepts any that has the key.
-
-    Attributes:
         share: the episodes that this process folds.
     """
 
-    def __init__(
-        self,
-        log: EventLog,
-        key: str,
-        projection: str | None,
-        version: int,
-        *,
-        number: int | None = None,
-        share: Share = WHOLE,
-    ) -> None:
-        self.log = log
-        self._key = key
-        self._projection = projection
-        self._version = version
-        self._number = number
-        self.share = share
-        self._place = ""
-        self._known: generations.Generation | None = None
-        self._unmarked = 0  # the events behind the mark, at the last check
+    log: EventLog
+    key: str
+    projection: str | None
+    version: int
+    number: int | None = None
+    share: Share = WHOLE
+    _place: str = field(default="", init=False)
+    _known: generations.Generation | None = field(default=None, init=False)
+    _unmarked: int = field(default=0, init=False)
+    """The events behind the mark, at the last check."""
 
     async def behind(self, connection: AsyncConnection, after: int, limit: int) -> list[EpisodeRow]:
         generation = await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
@@ -697,13 +687,13 @@ class SideTarget:
             after=after,
             limit=min(limit, _BEHIND_EPISODES_MAX),
             share=self.share,
-            after_tables=self._projection is not None,
+            after_tables=self.projection is not None,
             newer=(await self._marked(connection, generation))[1],
         )
 
     async def _marked(self, connection: AsyncConnection, generation: generations.Generation) -> tuple[int, int]:
         """Return the rowid of the mark, 0 without one, and the rowid above which episodes have to be checked."""
-        if self._projection is None or not self.log.address.is_sqlite:
+        if self.projection is None or not self.log.address.is_sqlite:
             return 0, 0
         key = f"event.episode = folded >> {NUMBER_SHIFT} AND event.sequence = folded >> 5 & {SEQUENCE_MAX}"
         query = text(f"""
@@ -742,22 +732,22 @@ coalesce((SELECT event.rowid FROM {self._place} AS mark JOIN event ON {key} WHER
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
         if not await advance(connection, self._place, steps, parked):
             return False
-        for number, reason in parked.items() if self._projection is not None else ():
-            _log.warning("episode %s is parked in the projection %s: %s", number, self._projection, reason)
+        for number, reason in parked.items() if self.projection is not None else ():
+            _log.warning("episode %s is parked in the projection %s: %s", number, self.projection, reason)
         return True
 
     async def generation(self, connection: AsyncConnection, hold: generations.Hold | None) -> generations.Generation:
         known = None if hold == "change" else self._known
-        generation = await generations.read_generation(connection, self._key, hold=hold, known=known)
-        if generation is None or self._number not in (None, generation.number):
+        generation = await generations.read_generation(connection, self.key, hold=hold, known=known)
+        if generation is None or self.number not in (None, generation.number):
             raise InternalError(
-                f"another process replaced the tables of {self._projection or 'the memory'} during the fold"
+                f"another process replaced the tables of {self.projection or 'the memory'} during the fold"
             )
-        if generation.version != self._version:
+        if generation.version != self.version:
             raise DatabaseForeign(
-                f"its tables have version {generation.version} now, but this process folds version {self._version}"
+                f"its tables have version {generation.version} now, but this process folds version {self.version}"
             )
-        self._place = place_of(generation.number, self._projection)
+        self._place = place_of(generation.number, self.projection)
         self._known = generation
         return generation
 
@@ -765,7 +755,7 @@ coalesce((SELECT event.rowid FROM {self._place} AS mark JOIN event ON {key} WHER
         self, connection: AsyncConnection, generation: generations.Generation, layout: Layout
     ) -> generations.Generation:
         grown = await generations.grow_tables(connection, generation, layout)
-        await generations.write_generation(connection, self._key, grown)
+        await generations.write_generation(connection, self.key, grown)
         return grown
 
     async def missing(self, number: int, sequence: int) -> str:

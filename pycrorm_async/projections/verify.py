@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
@@ -196,37 +197,32 @@ async def check_outside(
 # Check one episode of the log page by page: validate its events and fold them again.
 
 
+@dataclass(slots=True)
 class EpisodeCheck:
-    """The check of one episode, up to the last page read. Adds its findings to `result`, and its rows to `rows`.
+    """The check of one episode, up to the last page read. Adds its findings to the result, and its rows to the rows.
 
     Attributes:
-        head: the episode's last event.
         damaged_blocks: indexes of the blocks (`store.stored`) with an event for which damage was reported.
         described: whether an object added in the first block names its description.
     """
 
-    def __init__(
-        self,
-        episode: stored.EpisodeRow,
-        result: findings.VerifyResult,
-        designators: Designators,
-        rows: Rows,
-        descriptions: Collection[str],
-    ) -> None:
-        self.head = episode.head
-        self.damaged_blocks: set[int] = set()
-        self.described = False
-        self._episode = episode
-        self._number = episode.number
-        self._result = result
-        self._designators = designators
-        self._rows = rows
-        self._descriptions = descriptions
-        self._ended_wall_ns: int | None = None
-        self._order: OrderCheck | None = OrderCheck()
-        self._in_gap = False
-        self._lost: int | None = None
-        self._open_when_lost: set[int] = set()
+    _episode: stored.EpisodeRow
+    _result: findings.VerifyResult
+    _designators: Designators
+    _rows: Rows
+    _descriptions: Collection[str]
+    damaged_blocks: set[int] = field(default_factory=set)
+    described: bool = False
+    _ended_wall_ns: int | None = None
+    _order: OrderCheck | None = field(default_factory=OrderCheck)
+    _in_gap: bool = False
+    _lost: int | None = None
+    _open_when_lost: set[int] = field(default_factory=set)
+
+    @property
+    def head(self) -> int:
+        """The episode's last event."""
+        return self._episode.head
 
     def read(
         self,
@@ -250,8 +246,8 @@ class EpisodeCheck:
         if span.last < episode.head or self._order is None:
             return
         if self._ended_wall_ns is None and episode.ended_wall_ns is not None:
-            evidence = "the episode has an end, and no EpisodeEnded"
-            self._result.add_deleted(self._number, span.last + 1, f"it and all behind it were deleted: {evidence}")
+            reason = "it and all behind it were deleted: the episode has an end, and no EpisodeEnded"
+            self._result.add_deleted(episode.number, span.last + 1, reason)
         elif self._ended_wall_ns != episode.ended_wall_ns:
             self._damaged(span.last, f"the episode's ended_wall_ns is {episode.ended_wall_ns}{_OTHER_TIME}")
 
@@ -270,7 +266,7 @@ class EpisodeCheck:
         if event.type == EpisodeEnded.__name__:
             self._ended_wall_ns = event.wall_ns
         for reference in references_in(event.type, event.payload):
-            self._result.blobs.setdefault(reference.hash, (self._number, event.sequence))
+            self._result.blobs.setdefault(reference.hash, (self._episode.number, event.sequence))
         try:
             if isinstance(happening, Exception):
                 raise happening  # noqa: TRY301  one that folding raises is reported alike
@@ -301,11 +297,11 @@ class EpisodeCheck:
         if sequence <= self._episode.folded and self._lost is None:
             self._lost = sequence
             keys = (row_key(key) for key, row in self._rows.nodes.items() if row[STATUS] == "RUNNING")
-            self._open_when_lost = {key.sequence for key in keys if key.number == self._number}
+            self._open_when_lost = {key.sequence for key in keys if key.number == self._episode.number}
 
     def _damaged(self, sequence: int, reason: str) -> None:
         self.damaged_blocks.add((sequence - 1) // stored.BLOCK_EVENTS)
-        self._result.add_damage(self._number, sequence, reason)
+        self._result.add_damage(self._episode.number, sequence, reason)
 
 
 _OTHER_TIME = ", and the event has another time: one of them was changed after it was stored"

@@ -26,10 +26,9 @@ import logging
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from hashlib import sha256
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Final, NamedTuple, Protocol
 
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -283,42 +282,41 @@ class _Plan(NamedTuple):
     digests: Extension | None
 
 
+@dataclass(slots=True)
 class Appending:
-    """One batch and its append; use it once. Digests are stored only if `digests` is given.
+    """One batch and its append; use it once. What was erased or archived is not stored again.
 
-    Calls `on_wait` when the database begins to store the events. `witness` is an episode and its confirmed head. A new
-    episode gets its number in `numbers` if no other has it. What was erased or archived is not stored again; with
-    `restoring`, archived episodes are, under their numbers.
-    With `are_stored` the events are in the log already, behind the heads of their episodes, which `write` advances.
+    Attributes:
+        digests: of the episodes that this process appends to; None stores none.
+        on_wait: called when the database begins to store the events.
+        witness: an episode and its confirmed head.
+        numbers: of new episodes, unless another has them.
+        restoring: whether archived episodes are stored, under their numbers.
+        are_stored: whether the events are in the log already, behind the heads of their episodes, which `write`
+            advances.
+        episodes: the records by episode.
+        warnings: of limits that the batch came near, by "numbers" or an episode's id.
+        discarded: the episodes of the batch that were removed from the log, and whose events are not stored again.
+        extension: the digests that `write` inserted, to be kept after the commit.
     """
 
-    def __init__(
-        self,
-        dialect: Dialect,
-        records: Sequence[Record],
-        digests: RunningDigests | None = None,
-        *,
-        on_wait: Callable[[], None] = lambda: None,
-        witness: tuple[EpisodeId, int] | None = None,
-        numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
-        restoring: bool = False,
-        are_stored: bool = False,
-    ) -> None:
-        self._on_wait = on_wait
-        self._restoring = restoring
-        self._are_stored = are_stored
-        self._dialect = dialect
-        self._digests = digests
-        self._witness = witness
-        self._numbers = numbers
+    dialect: Dialect
+    records: InitVar[Sequence[Record]]
+    digests: RunningDigests | None = None
+    on_wait: Callable[[], None] = lambda: None
+    witness: tuple[EpisodeId, int] | None = None
+    numbers: Mapping[EpisodeId, int] = field(default_factory=dict)
+    restoring: bool = False
+    are_stored: bool = False
+    episodes: dict[EpisodeId, list[Record]] = field(init=False)
+    warnings: dict[str, str] = field(default_factory=dict)
+    discarded: dict[EpisodeId, storeds.RemovedEpisode] = field(default_factory=dict)
+    extension: Extension | None = None
+    _declarations: dict[str, bytes] = field(init=False)
+    _plan: _Plan | None = None
+
+    def __post_init__(self, records: Sequence[Record]) -> None:
         self._declarations, self.episodes = sort(records)
-        self._plan: _Plan | None = None
-        self.warnings: dict[str, str] = {}
-        """Warnings of limits that the batch came near, by "numbers" or an episode's id."""
-        self.discarded: dict[EpisodeId, storeds.RemovedEpisode] = {}
-        """The episodes of the batch that were removed from the log, and whose events are not stored again."""
-        self.extension: Extension | None = None
-        """The digests that `write` inserted, to be kept after the commit."""
 
     async def prepare(self, connection: AsyncConnection) -> None:
         """Read the episodes in a reading transaction and build the statements for them. Optional."""
@@ -330,7 +328,7 @@ class Appending:
         Raises `LogWentBack` if the log holds less of the witness than it had confirmed, and `LogDamaged` if another
         event is stored under a record's key; the caller must then roll back.
         """
-        dialect = self._dialect
+        dialect = self.dialect
         if self._declarations:
             await _insert_declarations(dialect, connection, self._declarations)
         if not self.episodes:
@@ -346,17 +344,17 @@ class Appending:
             await dialect.execute(connection, schema.UPSERT_EPISODES, rows=rows)
             self.warnings = warnings_of(changed)
         if any(each.fresh for each in plan.steps.values()):
-            if self._are_stored:
+            if self.are_stored:
                 [parts] = plan.insertion.values()
                 deque(parts, 0)  # computes the digests
             else:
-                self._on_wait()
+                self.on_wait()
                 try:
                     await dialect.insert(connection, plan.insertion)
                 except RowRefused as error:
                     raise StoredAhead(f"events behind the head of their episode are stored already: {error}") from error
-            if self._digests is not None and plan.digests is not None:
-                await self._digests.insert(connection, plan.digests)
+            if self.digests is not None and plan.digests is not None:
+                await self.digests.insert(connection, plan.digests)
                 self.extension = plan.digests
         else:
             await dialect.force_durable_commit(connection)
@@ -374,29 +372,29 @@ class Appending:
             return
         rows, _ = await self._read_or_create_rows(connection)
         new = [(*row[:3], row.started_wall_ns, None, None) for each, row in rows.items() if each not in present]
-        await self._dialect.execute(connection, schema.UPSERT_EPISODES, rows=new)
+        await self.dialect.execute(connection, schema.UPSERT_EPISODES, rows=new)
 
     async def _make_plan(
         self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, storeds.EpisodeRow]
     ) -> _Plan:
         steps = {each: step(self.episodes[each], row) for each, row in known_rows.items()}
         extending = [known_rows[each] for each, change in steps.items() if change.fresh]
-        digests = None if self._digests is None else await self._digests.begin(connection, extending)
-        insertion = await self._dialect.event_insertion(_parts_of(steps.values(), digests))
+        digests = None if self.digests is None else await self.digests.begin(connection, extending)
+        insertion = await self.dialect.event_insertion(_parts_of(steps.values(), digests))
         return _Plan(known_rows, steps, insertion, digests)
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, storeds.EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""
         names = {episode_text(each): each for each in self.episodes}
-        witness, confirmed = self._witness or (None, 0)
+        witness, confirmed = self.witness or (None, 0)
         ids = [(each,) for each in names]
         if witness is None:
-            rows = await self._dialect.rows(connection, storeds.EpisodeRow, schema.LOCK_EPISODES, ids=ids)
+            rows = await self.dialect.rows(connection, storeds.EpisodeRow, schema.LOCK_EPISODES, ids=ids)
         else:
             name, statement = episode_text(witness), schema.LOCK_EPISODES_AND_READ_WITNESS
-            rows = await self._dialect.rows(connection, storeds.EpisodeRow, statement, ids=ids, witness=name)
+            rows = await self.dialect.rows(connection, storeds.EpisodeRow, statement, ids=ids, witness=name)
             head = max((row.head for row in rows if row.id == name), default=0)
-            if head < confirmed and not await removed_of(self._dialect, connection, [witness]):
+            if head < confirmed and not await removed_of(self.dialect, connection, [witness]):
                 raise LogWentBack(name, confirmed, head)
         return {names[row.id]: row._replace(folded=0, parked=None) for row in rows if row.id in names}
 
@@ -408,9 +406,9 @@ class Appending:
         refusals: dict[EpisodeId, str] = {}
         missing = [each for each in self.episodes if each not in rows]
         restored: dict[EpisodeId, int] = {}
-        for each, removed in (await removed_of(self._dialect, connection, missing)).items() if missing else ():
+        for each, removed in (await removed_of(self.dialect, connection, missing)).items() if missing else ():
             missing.remove(each)
-            if self._restoring and removed.archived_in is not None:
+            if self.restoring and removed.archived_in is not None:
                 restored[each] = removed.number
             elif removed.archived_in is None or self.episodes[each][-1].sequence <= removed.head:
                 self.discarded[each] = removed
@@ -418,7 +416,7 @@ class Appending:
                 refusals[each] = str(removed)
         if restored:
             now_ns, numbers = SYSTEM_CLOCK.wall_ns(), [(number,) for number in restored.values()]
-            await self._dialect.execute(connection, schema.UPDATE_RESTORED, now_ns=now_ns, numbers=numbers)
+            await self.dialect.execute(connection, schema.UPDATE_RESTORED, now_ns=now_ns, numbers=numbers)
         assigned = restored | (await self._assign_numbers(connection, missing) if missing else {})
         for each, number in assigned.items():
             if number > EPISODE_NUMBER_MAX:
@@ -431,16 +429,16 @@ class Appending:
         return rows, refusals
 
     async def _assign_numbers(self, connection: AsyncConnection, missing: Sequence[EpisodeId]) -> dict[EpisodeId, int]:
-        own = {each: self._numbers[each] for each in missing if each in self._numbers}
+        own = {each: self.numbers[each] for each in missing if each in self.numbers}
         taken: set[int] = set()
         if own:
             asked = [(number,) for number in own.values()]
-            taken.update((await self._dialect.execute(connection, schema.SELECT_NUMBERS, numbers=asked)).scalars())
+            taken.update((await self.dialect.execute(connection, schema.SELECT_NUMBERS, numbers=asked)).scalars())
         numbers = {each: number for each, number in own.items() if number not in taken}
         new = [each for each in missing if each not in numbers]
         if new:
             above = max(numbers.values(), default=0)
-            numbers |= zip(new, await self._dialect.new_numbers(connection, len(new), above=above), strict=True)
+            numbers |= zip(new, await self.dialect.new_numbers(connection, len(new), above=above), strict=True)
         return numbers
 
 
