@@ -324,7 +324,7 @@ class _Copier:
     async def _append(self) -> None:
         batch, self._batch, self._batch_events, self._batch_bytes = self._batch, {}, 0, 0
         declarations = await self._declarations(batch.values())
-        records = {episode: _records(episode, events) for episode, events in batch.items()}
+        records = {episode: _records(episode, events) for episode, events in batch.items() if events}
         try:
             await self._append_at_once([*declarations, *chain.from_iterable(records.values())])
         except DamageError:

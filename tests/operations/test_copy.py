@@ -25,7 +25,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.writer.drain import Backoff
 from tests.crash.forked_processes import ForkedProcess
-from tests.databases import Server, ask, ask_to_change
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.hand_written import fill, hand_written
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.operations.memories import (
@@ -44,7 +44,7 @@ from tests.projections.rebuild_cases import traces
 from tests.store.factories import episode, record, run_of
 from tests.table_comparison import Logs, logs_of, tables_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 
 
 # === copy =====================================================================================================
@@ -75,7 +75,6 @@ def test_events_of_all_versions_name_a_type_by_the_same_digits_of_its_fingerprin
 # --- complete copies --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_memory_copied_to_a_server_and_back_is_the_same_and_the_source_is_not_written(
     new_file: New, server: Server
 ) -> None:
@@ -93,7 +92,6 @@ async def test_a_memory_copied_to_a_server_and_back_is_the_same_and_the_source_i
     assert hashlib.sha256(path_of(source).read_bytes()).digest() == before
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_events_that_the_target_has_are_not_copied_again(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     await notes(source, "a", "b")
@@ -106,7 +104,6 @@ async def test_events_that_the_target_has_are_not_copied_again(new_url: New, new
     assert_same(source, target)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_only_the_requested_episodes_are_copied_with_their_own_types(new_file: New) -> None:
     source, target = new_file(), new_file()
     await notes(source, "a")
@@ -122,7 +119,6 @@ async def test_only_the_requested_episodes_are_copied_with_their_own_types(new_f
     assert_same(source, target)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_an_episode_that_is_longer_in_the_target_is_not_changed(new_file: New) -> None:
     source, target = new_file(), new_file()
     records = hand_written(1).records
@@ -136,7 +132,6 @@ async def test_an_episode_that_is_longer_in_the_target_is_not_changed(new_file: 
 # --- two sources ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_copy_repeats_each_step_in_which_another_process_hinders_it(
     new_file: New, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,7 +158,6 @@ async def test_a_copy_repeats_each_step_in_which_another_process_hinders_it(
     assert_same(source, target)
 
 
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak
 async def test_two_memories_merge_into_the_same_one_in_any_order_and_at_once_and_are_rebuilt(
     new_url: New, new_file: New
@@ -194,7 +188,6 @@ async def test_two_memories_merge_into_the_same_one_in_any_order_and_at_once_and
 # --- concurrent recorders ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_running_episode_is_copied_as_far_as_it_is_and_later_completed(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     await notes(source, "before")
@@ -225,7 +218,6 @@ def copy_and_print(source: str, target: str) -> None:
         asyncio.run(copying)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_file: New) -> None:
     rounds = 6
     source, target = new_file(), new_url()
@@ -256,7 +248,6 @@ async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_
     assert_same(source, target)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_events_appended_but_not_folded_before_a_kill_are_folded_by_the_next_copy(new_file: New) -> None:
     source, target = new_file(), new_file()
     await fill(source, [hand_written(1)])
@@ -268,7 +259,6 @@ async def test_events_appended_but_not_folded_before_a_kill_are_folded_by_the_ne
 # --- wrong use --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_a_copy_of_the_files_of_a_memory_is_recognised_as_the_same_memory(new_file: New) -> None:
     source, target = new_file(), new_file()
     await notes(source, "a")
@@ -277,7 +267,6 @@ async def test_a_copy_of_the_files_of_a_memory_is_recognised_as_the_same_memory(
         await copy_episodes(source, target)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_large_events_are_copied_in_small_batches(new_file: New, monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = new_file(), new_file()
     big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 20_000)
@@ -322,7 +311,6 @@ def new_url(request: pytest.FixtureRequest, new_file: Callable[[], str]) -> Call
 # Damage, gaps and contradictions in one of two memories are reported, and everything else is copied.
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_other_bytes_under_one_key_are_reported_and_the_other_episodes_are_copied(
     new_url: New, new_file: New
 ) -> None:
@@ -347,7 +335,6 @@ async def test_other_bytes_under_one_key_are_reported_and_the_other_episodes_are
     assert after == copied_logs
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_other_episodes_are_copied(
     new_url: New, new_file: New
 ) -> None:
@@ -372,24 +359,31 @@ async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_othe
     assert copied_logs == {each: events for each, events in logs_of(source).items() if each in copied_logs}
 
 
-@pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("sequence", [1, 7])
-async def test_of_an_episode_with_a_gap_the_events_before_it_are_copied(new_file: New, sequence: int) -> None:
+@pytest.mark.parametrize(
+    ("sequence", "change", "fault"),
+    [
+        (1, "DELETE FROM event", "is missing in "),
+        (7, "DELETE FROM event", "is missing in "),
+        (5, "UPDATE event SET payload = '{'", "its payload cannot be read: "),
+        (5, """UPDATE event SET payload = '{"node":"four"}'""", "its payload cannot be read: "),
+    ],
+)
+async def test_of_an_episode_with_a_missing_or_unreadable_event_those_before_it_are_copied(
+    new_file: New, sequence: int, change: str, fault: str
+) -> None:
     source, target = new_file(), new_file()
     await fill(source, [hand_written(number) for number in (1, 2)])
-    ask_to_change(source, "DROP TRIGGER event_is_not_deleted")
-    ask_to_change(source, f"DELETE FROM event WHERE episode = 1 AND sequence = {sequence}")
+    change_each(source, ["DROP TRIGGER event_is_not_updated", "DROP TRIGGER event_is_not_deleted"])
+    ask_to_change(source, f"{change} WHERE episode = 1 AND sequence = {sequence}")
     for _ in range(2):
-        done = await copy_episodes(source, target)
-        (bad, good) = done.episodes
-        assert bad.damage == (f"episode 00000000-0000-7000-8000-000000000001, event {sequence}: is missing in {source}")
+        (bad, good) = (await copy_episodes(source, target)).episodes
+        assert f"{bad.damage} ".startswith(f"episode {bad.id}, event {sequence}: {fault}")
         assert (bad.head, good.head, good.damage) == (sequence - 1, 12, None)
     copied_logs = logs_of(target)
     assert [event[0] for event in copied_logs.get(bad.id, [])] == list(range(1, sequence))
     assert copied_logs[good.id] == logs_of(source)[good.id]
 
 
-@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(("sequence", "damaged"), [(1, 0), (12, 1)])
 async def test_a_gap_in_both_memories_is_reported(new_file: New, sequence: int, damaged: int) -> None:
     source, target = both = new_file(), new_file()
@@ -402,22 +396,6 @@ async def test_a_gap_in_both_memories_is_reported(new_file: New, sequence: int, 
     assert (good.were_there, good.copied, good.damage) == (12, 0, None)
 
 
-@pytest.mark.soak_on("postgresql")
-@pytest.mark.parametrize("payload", ["{", '{"node":"four"}'])
-async def test_of_an_episode_with_an_unreadable_event_the_events_before_it_are_copied(
-    new_file: New, payload: str
-) -> None:
-    source, target = new_file(), new_file()
-    await fill(source, [hand_written(number) for number in (1, 2)])
-    ask_to_change(source, "DROP TRIGGER event_is_not_updated")
-    ask_to_change(source, "UPDATE event SET payload = ? WHERE episode = 1 AND sequence = 5", [payload])
-    (bad, good) = (await copy_episodes(source, target)).episodes
-    assert bad.damage is not None
-    assert bad.damage.startswith(f"episode {bad.id}, event 5: its payload cannot be read: ")
-    assert (bad.head, good.head, good.damage) == (4, 12, None)
-
-
-@pytest.mark.soak_on("postgresql")
 async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     script = Script(1)
@@ -430,7 +408,6 @@ async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_
     assert logs_of(target) == logs_of(source)
 
 
-@pytest.mark.soak_on("postgresql")
 async def test_an_episode_whose_type_contradicts_the_target_is_copied_and_folded_under_other_names(
     new_file: New,
 ) -> None:
