@@ -68,11 +68,8 @@ def contents(url: str) -> list[set[Any]]:
 
 
 async def verify_shows_no_fault(url: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(url), create=False) as log:
         result = await verify(log)
-    finally:
-        await log.close()
     assert (result.damage, result.drift, result.behind, result.outdated) == (0, 0, 0, None)
     assert not result.stopped
     assert not result.unmade

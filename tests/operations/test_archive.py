@@ -194,14 +194,12 @@ async def test_an_episode_is_erased_from_the_lake_too_and_cannot_be_restored(tmp
         connection.execute("ALTER TABLE erased DROP COLUMN reason")
     with pytest.raises(UnknownEpisode, match=rf"{ids[1]} was erased on .* UTC$"):
         await copy_episodes(lake, other, episodes=[ids[1]])
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:  # one that came back, and that the lake still holds, is archived nowhere else, and erased there too
+    # One that came back, and that the lake still holds, is archived nowhere else, and erased there too.
+    async with await EventLog.open(DatabaseAddress.parse(url), create=True) as log:
         await copy_episodes(lake, url)
         [stayed] = (await archived(url, f"ducklake:{tmp_path}/other")).stayed.values()
         assert stayed == f"it was restored from {lake}, which has it still: archive it there"
         await erase(log, await erasable(log, ["1"]), reason="asked", spool=tmp_path / "memory.db.spool")
-    finally:
-        await log.close()
     assert query_lake(lake, "SELECT count(*) FROM event")[1] == [(0,)]
 
 

@@ -53,20 +53,14 @@ async def erased(
     url: str, *names: str, spool: Path | None = None, reason: str = "asked to", lake: str | None = None
 ) -> list[ErasedEpisode]:
     address = DatabaseAddress.parse(url)
-    log = await EventLog.open(address, create=True)
-    try:
+    async with await EventLog.open(address, create=True) as log:
         rows = await erasable(log, names)
         return await erase(log, rows, reason=reason, spool=spool or address.default_spool, lake=lake)
-    finally:
-        await log.close()
 
 
 async def assert_clean(url: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(url), create=False) as log:
         result = await verify(log, projections=own_projections())
-    finally:
-        await log.close()
     found = [*map(str, result.damages), *map(str, result.differences), *result.not_compared, *map(str, result.stopped)]
     assert found == []
 
@@ -139,15 +133,7 @@ async def test_an_episode_is_erased_from_tables_and_cases_of_an_earlier_version(
     assert ask(url, "SELECT number, reason FROM pycrorm_removed_episode") == [(1, "asked to")]
 
 
-async def test_the_number_of_the_last_episode_is_not_given_to_another_one(database_url: str, in_folder: Path) -> None:
-    await recorded(database_url, "first", SECRET)
-    await erased(database_url, "2")
-    await recorded(database_url, "third")
-    assert [number for (number,) in ask(database_url, "SELECT number FROM episode ORDER BY number")] == [1, 3]
-    await assert_clean(database_url)
-
-
-async def test_what_arrives_of_an_erased_episode_is_discarded_once_and_for_all(
+async def test_what_arrives_of_an_erased_episode_is_discarded_and_its_number_is_not_given_again(
     database_url: str, in_folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     [_, identity] = await recorded(database_url, "first", SECRET)
@@ -155,8 +141,7 @@ async def test_what_arrives_of_an_erased_episode_is_discarded_once_and_for_all(
     await copy_episodes(database_url, copy)
     events = logs_of(database_url)[identity]
     await erased(database_url, "2")
-    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(database_url), create=True) as log:
         [row] = [each for each in await log.all_removed() if each.id == identity]
         episode = parse_episode_id(identity)
         records = [
@@ -166,11 +151,11 @@ async def test_what_arrives_of_an_erased_episode_is_discarded_once_and_for_all(
         assert await log.append(records) == {}  # not refused, so that no spool offers them again
         assert log.discarded == {identity: row.head}
         assert f"events that arrive of it are discarded: {row}" in caplog.text
-    finally:
-        await log.close()
     summary = await copy_episodes(copy, database_url)
     assert [(each.copied, "was erased" in (each.stopped or "")) for each in summary.episodes] == [(0, False), (0, True)]
     assert places_with(SECRET, database_url) == []
+    await recorded(database_url, "third")  # which does not get the number of the erased one
+    assert [number for (number,) in ask(database_url, "SELECT number FROM episode ORDER BY number")] == [1, 3]
     await assert_clean(database_url)
 
 

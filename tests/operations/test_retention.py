@@ -73,8 +73,7 @@ async def test_what_no_rule_keeps_goes_and_what_runs_or_is_kept_by_its_tag_stays
                 pass
         async with memory.episode(description="runs", tags=("tryout",)):
             await memory.flush()
-            log = await EventLog.open(address, create=True)
-            try:
+            async with await EventLog.open(address, create=True) as log:
                 assert (await read_rules(log), await due_episodes(log, [], 2**62)) == ([], [])
                 ended_ns = {each.number: each.ended_wall_ns or 0 for each in await log.episodes()}
                 await add_rule(log, "9d", timedelta(days=9), (), place)
@@ -96,8 +95,6 @@ async def test_what_no_rule_keeps_goes_and_what_runs_or_is_kept_by_its_tag_stays
                 assert await due(late_ns) == [1, 3]
                 result = await apply_rules(database_url, log, {1, 3, 4}, late_ns, spool=spool)
                 assert await due(late_ns) == []
-            finally:
-                await log.close()
     removed = [*result.erased, *(each for some in result.archived.values() for each in some.removed)]
     assert len(removed) == 2
     assert ask(database_url, "SELECT number FROM episode ORDER BY 1") == [(2,), (4,)]
@@ -112,14 +109,11 @@ async def test_what_no_rule_keeps_goes_and_what_runs_or_is_kept_by_its_tag_stays
         assert all(each.left for each in result.erased)  # the recorder that ran had the segment
         rename = "UPDATE pycrorm_removed_episode SET reason = '{}' WHERE number = 1"
         ask_to_change(database_url, rename.format("retention policy of the lab"))  # of a user, who finishes it
-        log = await EventLog.open(address, create=True)
-        try:
+        async with await EventLog.open(address, create=True) as log:
             for number, reason in (3, "retention --keep 9d"), (1, ""):
                 finished = await apply_rules(database_url, log, (), late_ns, spool=spool)
                 assert [(each.removed.number, each.left) for each in finished.erased] == [(number, ())]
                 ask_to_change(database_url, rename.format(reason))
-        finally:
-            await log.close()
         assert places_with("Amsel", database_url) == []
     await assert_clean(database_url)
 
@@ -129,8 +123,7 @@ async def test_a_tag_that_is_not_in_the_tables_yet_keeps_its_episode(tmp_path: P
     url = f"sqlite:///{tmp_path}/memory.db"
     async with Memory.open(url) as memory, memory.episode(description="old"):
         pass
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(url), create=True) as log:
         await add_rule(log, "1d", timedelta(days=1), (), None)
         await add_rule(log, "forever", None, ("keep",), None)
         rules, [row] = await read_rules(log), await log.episodes()
@@ -138,18 +131,13 @@ async def test_a_tag_that_is_not_in_the_tables_yet_keeps_its_episode(tmp_path: P
         await _append(log, row, EpisodeTagged(("keep",), ()), SYSTEM_CLOCK)
         assert ask(url, "SELECT folded < head FROM episode") == [(1,)]
         assert await due_episodes(log, rules, 2**62) == []
-    finally:
-        await log.close()
 
 
 async def due_after_a_day(url: str, *tags: str) -> list[int]:
     """Return the due episodes of a memory in which episodes with these tags stay for a day."""
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(url), create=True) as log:
         await add_rule(log, "1d", timedelta(days=1), tags, None)
         return [each.row.number for each in await due_episodes(log, await read_rules(log), 2**62)]
-    finally:
-        await log.close()
 
 
 @pytest.mark.slow
@@ -179,13 +167,10 @@ async def test_a_lake_that_is_away_keeps_only_what_it_would_get_and_the_rest_is_
     shift = "SET started_wall_ns = started_wall_ns - {0}, ended_wall_ns = ended_wall_ns - {0}"
     ask_to_change(url, f"UPDATE episode {shift.format(2 * DAY_S * 10**9)}")
     (tmp_path / "away").touch()  # where the folder of the lake was
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(url), create=True) as log:
         for tag in ("away", "there"):
             await add_rule(log, "1d", timedelta(days=1), (tag,), f"ducklake:{tmp_path}/{tag}")
         await add_rule(log, "1d", timedelta(days=1), (), None)
-    finally:
-        await log.close()
     done = pycrorm("retention", "apply", "--yes", "--json", "--url", url, cwd=tmp_path)
     assert done.returncode == 3, done.stderr
     assert f"ducklake:{tmp_path}/away" in one_line_of(done)
@@ -205,8 +190,7 @@ async def test_an_episode_of_a_clock_that_was_years_behind_is_as_old_as_what_was
                 pass
     ask_to_change(url, "UPDATE episode SET started_wall_ns = 0, ended_wall_ns = 9 WHERE number IN (1, 4)")  # 1970
     day_ns = DAY_S * 10**9
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:
+    async with await EventLog.open(DatabaseAddress.parse(url), create=True) as log:
         rows = {each.number: each for each in await log.episodes()}
         await add_rule(log, "1d", timedelta(days=1), (), None)
         rules, last_ns = await read_rules(log), rows[3].started_wall_ns
@@ -219,8 +203,6 @@ async def test_an_episode_of_a_clock_that_was_years_behind_is_as_old_as_what_was
         assert 4 in await due(last_ns + day_ns + 1)
         old = await erasable(log, [], ended_before=datetime.fromtimestamp(last_ns / 1e9 - 1, UTC))
         assert [each.number for each in old] == [1]
-    finally:
-        await log.close()
 
 
 @pytest.mark.slow

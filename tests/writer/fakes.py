@@ -174,11 +174,8 @@ def opener(
 
     @asynccontextmanager
     async def opened() -> AsyncIterator[Destination]:
-        log = await EventLog.open(address, create=True, busy_timeout_s=busy_timeout_s)
-        try:
+        async with await EventLog.open(address, create=True, busy_timeout_s=busy_timeout_s) as log:
             yield around(CountingFold(log))
-        finally:
-            await log.close()
-            closed()
+        closed()
 
     return opened
