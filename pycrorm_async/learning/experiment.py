@@ -330,10 +330,13 @@ async def run(
         frames: list[pd.DataFrame] = []
         for number in range(experiment.rounds):
             name = "default policy" if number == 0 else f"learned policy, round {number + 1}"
-            explorer = _explorer(experiment, policy, first)
+            explorer = policy
+            if isinstance(policy, SuccessModel) and policy is not first:
+                is_random = experiment.explore is Draws.RANDOM
+                explorer = first if is_random else policy.drawing(experiment.explore)
             frames.append(await runner.phase(name, explorer, experiment.seed + number, experiment.rollouts))
             tries = pd.concat(frames)
-            policy = _learned(experiment, tries)
+            policy = learned_from(tries, experiment.model, experiment.min_samples_leaf)
             await runner.record(policy, rounds=number + 1, successes=len(recorded_rollouts.successes(tries)))
         await runner.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
@@ -346,23 +349,15 @@ async def run(
         return ExperimentResult(tuple(runner.phases), policy, successes, coverage, ceiling)
 
 
-def _explorer(experiment: Experiment, policy: AnyPolicy, first: AnyPolicy) -> AnyPolicy:
-    """Return the policy by which the next round acts."""
-    if not isinstance(policy, SuccessModel) or policy is first:
-        return policy
-    return first if experiment.explore is Draws.RANDOM else policy.drawing(experiment.explore)
-
-
-def _learned(experiment: Experiment, tries: pd.DataFrame) -> AnyPolicy:
-    """Return the policy learned from these rollouts. Raises `NotEnoughExperience`."""
-    leaf = experiment.min_samples_leaf
-    match experiment.model:
+def learned_from(tries: pd.DataFrame, model: Learned, min_samples_leaf: int) -> AnyPolicy:
+    """Return the policy of this kind that these pick-ups teach. Raises what `SuccessModel.fit` or `learn` raises."""
+    match model:
         case Learned.SUCCESS:
-            return SuccessModel.fit(tries, min_samples_leaf=leaf)
+            return SuccessModel.fit(tries, min_samples_leaf=min_samples_leaf)
         case Learned.POLAR:
-            return learn_polar(recorded_rollouts.successes(tries), min_samples_leaf=leaf)
+            return learn_polar(recorded_rollouts.successes(tries), min_samples_leaf=min_samples_leaf)
         case Learned.PLACES:
-            return learn(recorded_rollouts.successes(tries), min_samples_leaf=leaf)
+            return learn(recorded_rollouts.successes(tries), min_samples_leaf=min_samples_leaf)
 
 
 def drawn_of(policy: PolarPolicy | SuccessModel, context: PickUpContext, *, seed: int) -> list[PickUpChoice]:
@@ -568,75 +563,44 @@ async def study(
             for phase in (learned.default, learned.evaluation, learned.held_out)
         ]
     async with rollout_pool(experiment.workers, experiment.cluster, None) as workers:
-        evaluator = _Evaluator(experiment, workers, rollouts, report_progress)
-        return Study(
-            tuple([each async for each in evaluator.curve(default, held_out)]),
-            tuple([await evaluator.compare(scene, policy) for scene in scene_variants(experiment.scene)]),
-            tuple(
-                cost
-                for cost in (
-                    await evaluator.cost(learned.default, default_policy(), default),
-                    await evaluator.cost(learned.evaluation, policy, evaluation),
-                )
-                if cost is not None
-            ),
-        )
 
+        async def tally(
+            name: str, scene: Scene, policy: Policy, seed: int = experiment.seed + _STUDY_SEED, count: int = rollouts
+        ) -> Tally:
+            """Perform rollouts that nothing records."""
+            job = RolloutTask(scene, policy, seed, recorded=False)
+            length_max = min(ROLLOUTS_PER_RUN, -(-count // experiment.workers))
+            runs = recorded_rollouts.missing_runs((), count, length_max=length_max)
+            return await workers.roll_out(job, runs, lambda done: report_progress(name, done.rollouts, count, done))
 
-class _Evaluator:
-    """Run the evaluation's rollouts in workers that record nothing."""
-
-    def __init__(
-        self, experiment: Experiment, workers: RolloutPool, rollouts: int, report_progress: ReportProgress
-    ) -> None:
-        self._experiment = experiment
-        self._workers = workers
-        self._rollouts = rollouts
-        self._report_progress = report_progress
-        self._seed = experiment.seed + _STUDY_SEED
-
-    async def curve(self, default: pd.DataFrame, held_out: pd.DataFrame) -> AsyncIterator[CurvePoint]:
-        for size in CURVE:
-            if size > len(default):
-                return
+        curve: list[CurvePoint] = []
+        for size in (each for each in CURVE if each <= len(default)):
             successes = recorded_rollouts.successes(default, among=size)
-            try:
-                policy = learn(successes, min_samples_leaf=self._experiment.min_samples_leaf)
-            except NotEnoughExperience:
-                continue
-            tally = await self._tally(f"learned from {size:,} rollouts", self._experiment.scene, policy)
-            yield CurvePoint(size, len(successes), tally, coverage_of(held_out, policy))
-
-    async def compare(self, scene: Scene, policy: Policy) -> SceneComparison:
-        default = await self._tally(f"default policy: {scene}", scene, default_policy())
-        return SceneComparison(scene, default, await self._tally(f"learned policy: {scene}", scene, policy))
-
-    async def cost(self, phase: Phase, policy: Policy, frame: pd.DataFrame) -> Cost | None:
-        """Repeat rollouts of the phase without recording them; None if this run did not perform the phase.
-
-        Raises `InternalError` if the same rollouts ended differently.
-        """
-        if phase.rate is None:
-            return None
-        count = min(len(frame), 4 * self._rollouts)
-        began = time.monotonic()
-        tally = await self._tally(f"{phase.name}, not recorded", self._experiment.scene, policy, phase.seed, count)
-        seconds = time.monotonic() - began
-        if tally != recorded_rollouts.tally_of(frame[frame["index"] < count]):
-            raise InternalError(f"{phase.name}: the same rollouts ended differently without recording")
-        return Cost(phase.name, count, phase.rate, count / seconds)
-
-    async def _tally(
-        self, name: str, scene: Scene, policy: Policy, seed: int | None = None, count: int | None = None
-    ) -> Tally:
-        count = self._rollouts if count is None else count
-        job = RolloutTask(scene, policy, self._seed if seed is None else seed, recorded=False)
-        runs = recorded_rollouts.missing_runs(
-            (), count, length_max=min(ROLLOUTS_PER_RUN, -(-count // self._experiment.workers))
-        )
-        return await self._workers.roll_out(
-            job, runs, lambda tally: self._report_progress(name, tally.rollouts, count, tally)
-        )
+            with suppress(NotEnoughExperience):
+                point = learn(successes, min_samples_leaf=experiment.min_samples_leaf)
+                done = await tally(f"learned from {size:,} rollouts", experiment.scene, point)
+                curve.append(CurvePoint(size, len(successes), done, coverage_of(held_out, point)))
+        scenes = [
+            SceneComparison(
+                scene,
+                await tally(f"default policy: {scene}", scene, default_policy()),
+                await tally(f"learned policy: {scene}", scene, policy),
+            )
+            for scene in scene_variants(experiment.scene)
+        ]
+        costs: list[Cost] = []
+        for phase, used, frame in (
+            (learned.default, default_policy(), default),
+            (learned.evaluation, policy, evaluation),
+        ):
+            if phase.rate is not None:  # this run performed the phase
+                count, began = min(len(frame), 4 * rollouts), time.monotonic()
+                done = await tally(f"{phase.name}, not recorded", experiment.scene, used, phase.seed, count)
+                seconds = time.monotonic() - began
+                if done != tally_of(frame[frame["index"] < count]):
+                    raise InternalError(f"{phase.name}: the same rollouts ended differently without recording")
+                costs.append(Cost(phase.name, count, phase.rate, count / seconds))
+    return Study(tuple(curve), tuple(scenes), tuple(costs))
 
 
 # === kitchen trial ============================================================================================

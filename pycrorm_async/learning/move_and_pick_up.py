@@ -380,10 +380,16 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none fits."""
         self.keep_policy()
-        if self._model is not None:
-            yield from self._ranked()
+        if self._model is None:
+            yield from map(self.chosen, self._likeliest_first(self.grounded()))
             return
-        yield from map(self.chosen, self._likeliest_first(self.grounded()))
+        choices, rates = self.rated(max(PROPOSALS, self.samples), searched=True)
+        clearance = base_clearance()
+        clear = _diverse_ranking(choices, rates, lambda each: clearance is None or self.is_clear(each, clearance))
+        first = next(clear, None)
+        if first is None:
+            raise self._nowhere()
+        yield from map(self.way, islice(chain([first], clear), self.samples))
 
     def drawn(self, rng: np.random.Generator, policy: Policy | None = None) -> MoveAndPickUpPerformable:
         """Return one sample, without regard to obstacles and visibility; `policy` saves `policy_here`.
@@ -406,17 +412,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             choice = self._model.draw(rng, choices, context, possible, rates)
         else:
             [choice] = self._polar_ways(self._model, rng, 1, context, self.policy_here())
-        return self._predicted(self._model, [choice], context)[0]
-
-    def _ranked(self) -> Iterator[MoveAndPickUpPerformable]:
-        choices, rates = self.rated(max(PROPOSALS, self.samples), searched=True)
-        clearance = base_clearance()
-        clear = _diverse_ranking(choices, rates, lambda each: clearance is None or self.is_clear(each, clearance))
-        first = next(clear, None)
-        if first is None:
-            raise self._nowhere()
-        for choice in islice(chain([first], clear), self.samples):
-            yield self.way(choice)
+        return self._predicted(self._model, choice, context)
 
     def rated(self, count: int, *, searched: bool = False) -> tuple[Sequence[PickUpChoice], Floats]:
         """Draw ways to pick up at free places, and rate each: a model's probability, or a policy's density.
@@ -486,7 +482,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         """Return the action for this choice, with the prediction of a model."""
         if self._model is None:
             return self.chosen(choice)
-        return self._predicted(self._model, [choice], self.context_for(self._model))[0]
+        return self._predicted(self._model, choice, self.context_for(self._model))
 
     def context_for(self, model: AnyPolicy) -> PickUpContext:
         """Return the object's context for the robot. Raises `CallerError` for a policy of another robot."""
@@ -527,25 +523,20 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return [each._replace(torso=torso) for each, torso in zip(choices, torsos, strict=True)]
 
     def _predicted(
-        self, model: SuccessModel | PolarPolicy, choices: Sequence[PickUpChoice], context: PickUpContext
-    ) -> list[PredictedPickUpPerformable]:
-        """Return the actions of these choices, each with the model's prediction and its circumstances."""
-        shares: list[float] | list[None] = [None] * len(choices)
+        self, model: SuccessModel | PolarPolicy, choice: PickUpChoice, context: PickUpContext
+    ) -> PredictedPickUpPerformable:
+        """Return the action of this choice, with the model's prediction and its circumstances."""
+        share: float | None = None
         if isinstance(model, SuccessModel) and model.trees:
-            shares = model.probability(choices, context).tolist()
-        known = {name: values.tolist() for name, values in context.circumstances(choices).items()}
-        actions: list[PredictedPickUpPerformable] = []
-        for number, (choice, share) in enumerate(zip(choices, shares, strict=True)):
-            move = self.chosen(choice)
-            own = {name: None if math.isnan(values[number]) else values[number] for name, values in known.items()}
-            actions.append(
-                PredictedPickUpPerformable(
-                    move.standing_position, move.object_designator, move.arm, move.grasp, policy=self.policy_name,
-                    probability=share, torso=choice.torso, relative_x=choice.relative_x, relative_y=choice.relative_y,
-                    height=context.height - (context.torso if choice.torso is None else choice.torso), **own,
-                )
-            )  # fmt: skip
-        return actions
+            share = model.probability([choice], context).item()
+        known = {name: value.item() for name, value in context.circumstances([choice]).items()}
+        move = self.chosen(choice)
+        return PredictedPickUpPerformable(
+            move.standing_position, move.object_designator, move.arm, move.grasp, policy=self.policy_name,
+            probability=share, torso=choice.torso, relative_x=choice.relative_x, relative_y=choice.relative_y,
+            height=context.height - (context.torso if choice.torso is None else choice.torso),
+            **{name: None if math.isnan(value) else value for name, value in known.items()},
+        )  # fmt: skip
 
     def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples from around the mode of the grounded policy only, as the thesis' `iter_with_mode` does.
@@ -771,36 +762,35 @@ class RecalledPickUp(ActionDescription[MoveAndPickUpPerformable]):
         region = free_and_visible(objects.require_robot(), objects.in_world(self.target))
         clearance = base_clearance()
         tried: set[PickUpChoice] = set()
-        while (best := await self._best(source, region, clearance, tried)) is not None:
-            choice, way = best
-            tried.add(choice)
-            recalled = replace(self._default.chosen(choice), policy=None)
-            yield self._performable_of(recalled, "recall", expected=way.score)
 
-    async def _best(
-        self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]
-    ) -> tuple[PickUpChoice, PastSuccess] | None:
-        """Return the best way that is left and possible here."""
-        robot = objects.require_robot()
-        torso = robot.body.joint_position(robot.torso_joint()) if robot.description.torso_joint is not None else None
-        over_base = self.target.pose.position.z - robot.body.pose.position.z
-        arms = _own_arms(self._arms, self.target)
-        arm = arms[0] if len(arms) == 1 else None
-        ways = await source.successes(self.target.object_type, arm=arm, height=over_base, torso=torso)
-        places = np.array([each.stand.position[:2] for each in ways]).reshape(-1, 2)
-        for way, is_free in zip(ways, region.contains(*places.T), strict=True):
-            choice = PickUpChoice(way.arm, way.grasp, *way.stand.position[:2])
-            if (
-                is_free
-                and choice not in tried
+        def possible(way: PastSuccess, choice: PickUpChoice, arms: Sequence[Arms]) -> bool:
+            return (
+                choice not in tried
                 and way.arm in arms
                 and way.grasp in self._grasps
                 and way.score >= way.prior
                 and way.evidence >= _EVIDENCE_MIN
                 and (clearance is None or self._default.is_clear(choice, clearance))
-            ):
-                return choice, way
-        return None
+            )
+
+        while True:
+            robot = objects.require_robot()
+            joint = robot.description.torso_joint
+            torso = None if joint is None else robot.body.joint_position(joint)
+            over_base = self.target.pose.position.z - robot.body.pose.position.z
+            arms = _own_arms(self._arms, self.target)
+            arm = arms[0] if len(arms) == 1 else None
+            ways = await source.successes(self.target.object_type, arm=arm, height=over_base, torso=torso)
+            places = np.array([each.stand.position[:2] for each in ways]).reshape(-1, 2)
+            choices = [PickUpChoice(each.arm, each.grasp, *each.stand.position[:2]) for each in ways]
+            free = compress(zip(ways, choices, strict=True), region.contains(*places.T))
+            best = next((each for each in free if possible(*each, arms)), None)
+            if best is None:
+                return
+            way, choice = best
+            tried.add(choice)
+            recalled = replace(self._default.chosen(choice), policy=None)
+            yield self._performable_of(recalled, "recall", expected=way.score)
 
     def _performable_of(
         self, move: MoveAndPickUpPerformable, chosen_by: str, *, expected: float | None = None

@@ -116,6 +116,11 @@ class Evidence:
             if not -math.inf < low < high < math.inf:
                 raise CallerError(f"evidence on height takes an interval (low, high) in m, got {self.height}")
 
+    @cached_property
+    def limits(self) -> Floats:
+        """Those of the region, shape (4, number of rectangles); without a region, those of one rectangle, infinite."""
+        return _ANYWHERE if self.region is None else self.region.limits()
+
     def __and__(self, other: Evidence) -> Evidence:
         """Combine both conditions. Two disjoint heights give the empty region, which no pick-up fulfils."""
         region = other.region if self.region is None else self.region
@@ -356,7 +361,7 @@ class Policy:
             arm_shares, grasp_shares, _ = drawn.allowed(self.evidence)
             arms[rows] = _draw_indices(arm_shares, chance[1, rows])
             grasps[rows] = _draw_indices(grasp_shares, chance[2, rows])
-            x_min, x_max, y_min, y_max = self._limits[:, rectangle[rows]]
+            x_min, x_max, y_min, y_max = self.evidence.limits[:, rectangle[rows]]
             places[0, rows] = _draw_between(drawn.x, x_min, x_max, chance[3, rows])
             places[1, rows] = _draw_between(drawn.y, y_min, y_max, chance[4, rows])
         return [
@@ -427,7 +432,7 @@ class Policy:
         for number, rectangle in zip(*(each.tolist() for each in self._cells.nonzero()), strict=True):
             leaf = self.leaves[number]
             arms, grasps, height = leaf.allowed(self.evidence)
-            x_min, x_max, y_min, y_max = self._limits[:, rectangle].tolist()
+            x_min, x_max, y_min, y_max = self.evidence.limits[:, rectangle].tolist()
             x, y = leaf.x.peak(x_min, x_max, width_m), leaf.y.peak(y_min, y_max, width_m)
             probability = leaf.weight * height * float(arms.max() * grasps.max()) * x.probability * y.probability
             yield number, Rectangle(x.low, x.high, y.low, y.high), probability
@@ -440,24 +445,16 @@ class Policy:
     def _mass(self) -> float:
         return float(self._cells.sum())
 
-    @cached_property
-    def _limits(self) -> Floats:
-        return _limits(self.evidence)
-
 
 def _cells(leaves: Sequence[Leaf], evidence: Evidence) -> Floats:
     """Return the probability of each leaf in each rectangle under all evidence, shape (leaves, rectangles)."""
-    x_min, x_max, y_min, y_max = _limits(evidence)
+    x_min, x_max, y_min, y_max = evidence.limits
     cells = np.zeros((len(leaves), len(x_min)))
     for row, leaf in zip(cells, leaves, strict=True):
         arms, grasps, height = leaf.allowed(evidence)
         row[:] = leaf.weight * height * arms.sum() * grasps.sum()
         row *= (leaf.x.cdf(x_max) - leaf.x.cdf(x_min)) * (leaf.y.cdf(y_max) - leaf.y.cdf(y_min))
     return cells
-
-
-def _limits(evidence: Evidence) -> Floats:
-    return _ANYWHERE if evidence.region is None else evidence.region.limits()
 
 
 def _draw_between(marginal: Marginal, low: Floats, high: Floats, chance: Floats) -> Floats:

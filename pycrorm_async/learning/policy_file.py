@@ -108,12 +108,18 @@ def encode_policy(policy: AnyPolicy) -> bytes:
     """Return the policy as JSON; equal policies give equal bytes in every process."""
     if not isinstance(policy, Policy):
         return msgspec.json.encode(policy)
+    evidence = policy.evidence
     return msgspec.json.encode(
         _Policy(
             [each.name for each in ARMS],
             [each.name for each in GRASPS],
             policy.leaves,
-            _encode_evidence(policy.evidence),
+            _Evidence(
+                None if evidence.arms is None else sorted(each.name for each in evidence.arms),
+                None if evidence.grasps is None else sorted(each.name for each in evidence.grasps),
+                None if evidence.region is None else list(evidence.region.rectangles),
+                evidence.height,
+            ),
             policy.constant_height,
             msgspec.UNSET if policy.robot in _OF_VERSION_1 else policy.robot,
         )
@@ -175,13 +181,4 @@ def decode_policy(encoded: bytes) -> AnyPolicy:
         ),
         content.constant_height,
         content.robot or PR2.name,
-    )
-
-
-def _encode_evidence(evidence: Evidence) -> _Evidence:
-    return _Evidence(
-        None if evidence.arms is None else sorted(each.name for each in evidence.arms),
-        None if evidence.grasps is None else sorted(each.name for each in evidence.grasps),
-        None if evidence.region is None else list(evidence.region.rectangles),
-        evidence.height,
     )

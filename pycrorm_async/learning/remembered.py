@@ -40,14 +40,13 @@ from sqlalchemy.orm import aliased
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.events.types import LinkBoxValue
-from pycrorm_async.learning.experiment import KITCHEN_TRIAL, Learned, choices_of, rated
+from pycrorm_async.learning.experiment import KITCHEN_TRIAL, Learned, choices_of, learned_from, rated
 from pycrorm_async.learning.features import NEAR_SURFACE_M, Edge, PickUpContext, edges_around
 from pycrorm_async.learning.policy_cards import BAND_M
 from pycrorm_async.learning.policy_file import AnyPolicy, name_of
 from pycrorm_async.learning.recorded_policy import Evaluation, HeldOut, record_policy
 from pycrorm_async.learning.rollouts import with_parameters
-from pycrorm_async.learning.success_model import WITHOUT_HEIGHT, SuccessModel
-from pycrorm_async.learning.tree import learn, learn_polar
+from pycrorm_async.learning.success_model import WITHOUT_HEIGHT
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.derived_views import parameters_of
 from pycrorm_async.query.reading import Reading
@@ -341,13 +340,7 @@ def learn_remembered(
     """
 
     def fit(rows: pd.DataFrame) -> AnyPolicy:
-        match model:
-            case Learned.SUCCESS:
-                return SuccessModel.fit(rows, min_samples_leaf=min_samples_leaf)
-            case Learned.PLACES:
-                return learn(rows[_succeeded(rows)], min_samples_leaf=min_samples_leaf)
-            case Learned.POLAR:
-                return learn_polar(rows[_succeeded(rows)], min_samples_leaf=min_samples_leaf)
+        return learned_from(rows, model, min_samples_leaf)
 
     with_height = tries.dropna(subset=["height"]).reset_index(drop=True)
     if with_height.empty:

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, cast
 
@@ -26,7 +27,6 @@ from sqlalchemy.orm import aliased
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.features import CIRCUMSTANCES
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.policy import Policy
 from pycrorm_async.orm import (
     BatchRolloutAction,
     MoveAndPickUpAction,
@@ -256,18 +256,38 @@ async def batch_rollout(
     if min(count, first, seed) < 0:
         raise CallerError(f"count, first and seed of rollouts must be >= 0, got {count}, {first} and {seed}")
     tally = Tally()
+    reset = reset or objects.require_world().reset
+    policy = action.policy_here() if prepare is None else None
+    arms, grasps = (
+        sorted(each.name for each in members or ()) for members in (action.allowed.arms, action.allowed.grasps)
+    )
+
+    async def roll_out(indexes: range, report: Callable[[Tally], None]) -> None:
+        action.keep_policy()
+        for index in indexes:
+            if index > indexes.start and stop():
+                break
+            tried = action if prepare is None else action.of(prepare(seed, index))
+            try:
+                await tried.drawn(randomness(seed, index), policy).perform()
+            except PlanFailure as failure:
+                tally.failures[type(failure).__name__] += 1
+            else:
+                tally.successes += 1
+            reset()
+            report(tally)
+
     with _bar(count) if report_progress is None else nullcontext(report_progress) as report:
-        reset = reset or objects.require_world().reset
-        run = _Run(action, action.policy_here() if prepare is None else None, reset, prepare, stop, tally, report)
-        slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
-        for begin, length in slices:
+        length = count if each_in is None else 1
+        for begin in range(first, first + count, max(length, 1)):
             if stop():
                 break
-            arms, grasps = (
-                sorted(each.name for each in members or ()) for members in (action.allowed.arms, action.allowed.grasps)
-            )
-            batch = BatchRolloutActionPerformable(action.policy_name, scene, seed, begin, length, arms, grasps, run)
-            async with _episode_of(each_in, batch):
+            name, work = action.policy_name, partial(roll_out, range(begin, begin + length), report)
+            batch = BatchRolloutActionPerformable(name, scene, seed, begin, length, arms, grasps, work)
+            episode: AbstractAsyncContextManager[Any] = nullcontext()
+            if each_in is not None:
+                episode = each_in.episode(description=f"rollout {begin} under policy {name}", seed=seed)
+            async with episode:
                 await batch.perform()
     return tally
 
@@ -276,26 +296,6 @@ async def batch_rollout(
 def _bar(count: int) -> Iterator[Callable[[Tally], None]]:
     with progress_bar("rollouts", unit="rollouts") as report_progress:
         yield lambda tally: report_progress(tally.rollouts, count, f"{tally.success_rate:.1%} succeed")
-
-
-def _episode_of(memory: Memory | None, batch: BatchRolloutActionPerformable) -> AbstractAsyncContextManager[Any]:
-    if memory is None:
-        return nullcontext()
-    return memory.episode(description=f"rollout {batch.first} under policy {batch.policy}", seed=batch.seed)
-
-
-@dataclass
-class _Run:
-    """The parts of a batch that are not recorded."""
-
-    action: MoveAndPickUp
-    policy: Policy | None
-    """The policy in this scene; None if the scene varies."""
-    reset: Callable[[], None]
-    prepare: Callable[[int, int], objects.ObjectLike] | None
-    stop: Callable[[], bool]
-    tally: Tally
-    report: Callable[[Tally], None]
 
 
 @dataclass
@@ -312,25 +312,8 @@ class BatchRolloutActionPerformable(ActionAbstract):
     count: int
     arms: list[str] = field(default_factory=list)
     grasps: list[str] = field(default_factory=list)
-    _run: _Run | None = field(default=None, repr=False, compare=False)
+    _work: Callable[[], Awaitable[None]] | None = field(default=None, repr=False, compare=False)
 
     async def perform(self) -> None:
-        run = self._run
-        assert run is not None, "only batch_rollout creates and performs a batch"
-        run.action.keep_policy()
-        for index in self._indexes(run):
-            action = run.action if run.prepare is None else run.action.of(run.prepare(self.seed, index))
-            try:
-                await action.drawn(randomness(self.seed, index), run.policy).perform()
-            except PlanFailure as failure:
-                run.tally.failures[type(failure).__name__] += 1
-            else:
-                run.tally.successes += 1
-            run.reset()
-            run.report(run.tally)
-
-    def _indexes(self, run: _Run) -> Iterator[int]:
-        for index in range(self.first, self.first + self.count):
-            if index > self.first and run.stop():
-                return
-            yield index
+        assert self._work is not None, "only batch_rollout creates and performs a batch"
+        await self._work()

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
-from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.pose import JointType, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import PR2Arm
-from pycrorm_async.world.urdf_model import ENDLESS, Bounds, Joint, Model, along
+from pycrorm_async.world.urdf_model import ENDLESS, Bounds, Joint, Model, along, joint_lines
 
 if TYPE_CHECKING:
     import optik
@@ -42,6 +41,8 @@ _TINY = 1e-12
 class Reach(NamedTuple):
     """A target in the axes of the torso."""
 
+    tool: Vector
+    """Position of the tool frame relative to the origin of the pan joint, m."""
     wrist: Vector
     """Position of the wrist relative to the origin of the pan joint, m."""
     turn: Quaternion
@@ -59,13 +60,6 @@ class Curve(NamedTuple):
     """One row, because the elbow is the same for both rolls."""
     margin: Floats
     """Distance of the joint nearest to a limit from that limit, rad; negative if a joint is outside its limits."""
-
-
-def reach(arm_description: PR2Arm, tool: Vector, turn: Quaternion) -> Reach:
-    """Convert a tool frame at `tool` (m from the origin of the pan joint) with rotation `turn` to a `Reach`."""
-    ahead = rotated(turn, (1.0, 0.0, 0.0))
-    wrist = Vector(*(at - arm_description.tool_m * along for at, along in zip(tool, ahead, strict=True)))
-    return Reach(wrist, turn, ahead)
 
 
 def hand(arm_description: PR2Arm, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
@@ -92,32 +86,25 @@ def pan_windows(arm_description: PR2Arm, wrist: Vector, bounds: Sequence[Bounds]
     The lift axis moves on a circle around the pan axis, so its distance from the wrist, and with it the elbow angle,
     depends only on the absolute angle between pan and the direction of the wrist.
     """
-    swing = _swing(arm_description, wrist, bounds)
-    if swing is None:
-        return []
-    towards = math.atan2(wrist.y, wrist.x)
-    lower, upper = bounds[PAN]
-    windows = []
-    for centre in (towards - math.tau, towards, towards + math.tau):
-        for start, end in (
-            (centre - swing.upper, centre - swing.lower),
-            (centre + swing.lower, centre + swing.upper),
-        ):
-            if max(start, lower) <= min(end, upper):
-                windows.append(Bounds(max(start, lower), min(end, upper)))
-    return windows
-
-
-def _swing(arm_description: PR2Arm, wrist: Vector, bounds: Sequence[Bounds]) -> Bounds | None:
-    """Return the least and greatest angle between pan and wrist that the elbow's limits allow; None if none does."""
     folded, stretched = stretches_m(arm_description, bounds)
     across, offset = math.hypot(wrist.x, wrist.y), arm_description.shoulder_offset_m
     middle = across * across + wrist.z * wrist.z + offset * offset
     scale = max(2 * offset * across, _TINY)
     least, most = (middle - stretched**2) / scale, (middle - folded**2) / scale
     if least > 1 + ROUNDING or most < -1 - ROUNDING:
-        return None
-    return Bounds(math.acos(max(-1.0, min(1.0, most))), math.acos(max(-1.0, min(1.0, least))))
+        return []
+    nearest, farthest = (math.acos(max(-1.0, min(1.0, cosine))) for cosine in (most, least))
+    towards = math.atan2(wrist.y, wrist.x)
+    lower, upper = bounds[PAN]
+    windows = []
+    for centre in (towards - math.tau, towards, towards + math.tau):
+        for start, end in (
+            (centre - farthest, centre - nearest),
+            (centre + nearest, centre + farthest),
+        ):
+            if max(start, lower) <= min(end, upper):
+                windows.append(Bounds(max(start, lower), min(end, upper)))
+    return windows
 
 
 def stretches_m(arm_description: PR2Arm, bounds: Sequence[Bounds]) -> tuple[float, float]:
@@ -308,7 +295,7 @@ class Chain:
     def held(self) -> Held:
         """The part of a target's orientation that the arm holds, by the directions in which it moves and turns."""
         start = _start([_within_a_turn(bounds) for bounds in self.bounds.values()], 0)
-        _, jacobian = _miss(self._arm, start, {}, self._behind, Pose(), Held.ALL)
+        _, jacobian = _Descent(self._arm, (), {}, self._behind, Pose()).miss(start, Held.ALL)
         directions = int(np.linalg.matrix_rank(jacobian, tol=_EXACT))
         return Held.ALL if directions == 6 else Held.AHEAD if directions == 5 else Held.NONE
 
@@ -356,7 +343,7 @@ class Chain:
         slides = any(each.kind is JointType.PRISMATIC or each.mimic is not None for each in moving)
         answers: Iterator[Sequence[float]]
         if slides or self.held is not Held.ALL:
-            answers = _postures(moving, ranges, positions, self._behind, goal, self.held, DESCENTS_MAX)
+            answers = _Descent(moving, ranges, positions, self._behind, goal).postures(self.held, DESCENTS_MAX)
         else:
             answers = self._from_starts(goal @ self._behind.inverse(), ranges, starts)
         earlier: list[NDArray[np.float64]] = []
@@ -392,10 +379,8 @@ class Chain:
         """
         ranges = (_within_a_turn(ENDLESS), *(_within_a_turn(bounds[name]) for name in self.joints))
         mount = Joint("", JointType.FIXED, "", "", base.inverse() @ along(self._above, positions), *_NO_TURN)
-        for angles in _postures(
-            (_BASE, mount, *self._moving), ranges, positions, self._behind, target, self.held, HEADINGS_MAX
-        ):
-            yield angles[0]
+        descent = _Descent((_BASE, mount, *self._moving), ranges, positions, self._behind, target)
+        yield from (angles[0] for angles in descent.postures(self.held, HEADINGS_MAX))
 
 
 _NO_TURN = ((0.0, 0.0, 0.0), Vector(0.0, 0.0, 1.0), ENDLESS)
@@ -415,93 +400,84 @@ def _start(ranges: Sequence[Bounds], start: int) -> list[float]:
     ]
 
 
-def _postures(
-    joints: Sequence[Joint],
-    ranges: Sequence[Bounds],
-    given: Mapping[str, float],
-    behind: Pose,
-    goal: Pose,
-    held: Held,
-    starts: int,
-) -> Iterator[list[float]]:
-    """Yield the postures to which descents lead; `given` has the joints that others follow.
+class _Descent(NamedTuple):
+    """The search for postures of a chain by damped least squares.
 
-    Where the direction of the fingers cannot be held, the position is reached from the postures nearest to both.
+    Attributes:
+        joints: of the chain; those that follow no other are searched within `ranges`.
+        positions: of joints outside the chain that others follow.
+        behind: the tool's frame in the link that the last joint moves.
+        goal: of the tool, in the chain's first link.
     """
-    ends = []
-    for start in range(starts):
-        miss, angles = _descend(joints, ranges, given, behind, goal, held, _start(ranges, start))
-        if miss < _EXACT:
-            yield angles
-        ends.append((miss, angles))
-    if held is Held.AHEAD and min(ends)[0] >= _EXACT:
-        for _, nearest in sorted(ends)[:HEADINGS_MAX]:
-            miss, angles = _descend(joints, ranges, given, behind, goal, Held.NONE, nearest)
+
+    joints: Sequence[Joint]
+    ranges: Sequence[Bounds]
+    positions: Mapping[str, float]
+    behind: Pose
+    goal: Pose
+
+    def postures(self, held: Held, starts: int) -> Iterator[list[float]]:
+        """Yield the postures to which descents lead.
+
+        Where the direction of the fingers cannot be held, the position is reached from the postures nearest to both.
+        """
+        ends = []
+        for start in range(starts):
+            miss, angles = self.lowest(held, _start(self.ranges, start))
             if miss < _EXACT:
                 yield angles
+            ends.append((miss, angles))
+        if held is Held.AHEAD and min(ends)[0] >= _EXACT:
+            for _, nearest in sorted(ends)[:HEADINGS_MAX]:
+                miss, angles = self.lowest(Held.NONE, nearest)
+                if miss < _EXACT:
+                    yield angles
 
-
-def _descend(
-    joints: Sequence[Joint],
-    ranges: Sequence[Bounds],
-    given: Mapping[str, float],
-    behind: Pose,
-    goal: Pose,
-    held: Held,
-    start: Sequence[float],
-) -> tuple[float, list[float]]:
-    """Return the posture to which damped least squares lead, and the greatest part of the way that is left."""
-    lower, upper = np.array(ranges).T
-    angles = np.array(start)
-    miss, jacobian = _miss(joints, angles, given, behind, goal, held)
-    damping = 1e-2
-    for _ in range(STEPS_MAX):
-        if np.abs(miss).max() < _EXACT:
-            break
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), miss)
-        tried = np.clip(angles + step, lower, upper)
-        tried_miss, tried_jacobian = _miss(joints, tried, given, behind, goal, held)
-        if tried_miss @ tried_miss < miss @ miss:
-            stalls = tried_miss @ tried_miss > _STALLED * (miss @ miss) and damping < _STALLED_DAMPING
-            angles, miss, jacobian, damping = tried, tried_miss, tried_jacobian, max(damping / 4, _DAMPING_MIN)
-            if stalls:  # a local minimum, not the goal
+    def lowest(self, held: Held, start: Sequence[float]) -> tuple[float, list[float]]:
+        """Return the greatest part of the way that is left where a descent ends, and the posture there."""
+        lower, upper = np.array(self.ranges).T
+        angles = np.array(start)
+        miss, jacobian = self.miss(angles, held)
+        damping = 1e-2
+        for _ in range(STEPS_MAX):
+            if np.abs(miss).max() < _EXACT:
                 break
-        elif (damping := damping * 4) > _DAMPING_MAX:
-            break
-    return float(np.abs(miss).max()), [float(angle) for angle in angles]
+            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), miss)
+            tried = np.clip(angles + step, lower, upper)
+            tried_miss, tried_jacobian = self.miss(tried, held)
+            if tried_miss @ tried_miss < miss @ miss:
+                stalls = tried_miss @ tried_miss > _STALLED * (miss @ miss) and damping < _STALLED_DAMPING
+                angles, miss, jacobian, damping = tried, tried_miss, tried_jacobian, max(damping / 4, _DAMPING_MIN)
+                if stalls:  # a local minimum, not the goal
+                    break
+            elif (damping := damping * 4) > _DAMPING_MAX:
+                break
+        return float(np.abs(miss).max()), [float(angle) for angle in angles]
 
-
-def _miss(
-    joints: Sequence[Joint],
-    angles: Sequence[float] | NDArray[np.float64],
-    given: Mapping[str, float],
-    behind: Pose,
-    goal: Pose,
-    held: Held,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the way from the tool to the goal (m and rad), and its derivative by the joints that follow no other."""
-    free = {each.name: number for number, each in enumerate(each for each in joints if each.moves_freely)}
-    positions = {**given, **{name: float(angles[number]) for name, number in free.items()}}
-    frame = Pose()
-    frames: list[Pose] = []
-    for each in joints:
-        frame = frame @ along([each], positions)
-        frames.append(frame)
-    tool = frame @ behind
-    ahead = np.array(rotated(tool.orientation, (1.0, 0.0, 0.0)))
-    jacobian = np.zeros((6, len(free)))
-    for each, at in zip(joints, frames, strict=True):
-        leader, factor = (each.name, 1.0) if each.mimic is None else each.mimic[:2]
-        if each.kind is JointType.FIXED or leader not in free:
-            continue
-        axis = np.array(rotated(at.orientation, each.axis))
-        if each.kind is JointType.PRISMATIC:
-            jacobian[:3, free[leader]] += factor * axis
-        else:
-            arm = [to - start for to, start in zip(tool.position, at.position, strict=True)]
-            turn = {Held.ALL: axis, Held.AHEAD: axis - ahead * (ahead @ axis), Held.NONE: 0.0 * axis}[held]
-            jacobian[:, free[leader]] += factor * np.concatenate([np.cross(axis, arm), turn])
-    return np.array(_difference(tool, goal, held)), jacobian
+    def miss(self, angles: Sequence[float] | Floats, held: Held) -> tuple[Floats, Floats]:
+        """Return the way from the tool to the goal (m and rad), and its derivative by the joints that are searched."""
+        free = {each.name: number for number, each in enumerate(each for each in self.joints if each.moves_freely)}
+        positions = {**self.positions, **{name: float(angles[number]) for name, number in free.items()}}
+        frame = Pose()
+        frames: list[Pose] = []
+        for each in self.joints:
+            frame = frame @ along([each], positions)
+            frames.append(frame)
+        tool = frame @ self.behind
+        ahead = np.array(rotated(tool.orientation, (1.0, 0.0, 0.0)))
+        jacobian = np.zeros((6, len(free)))
+        for each, at in zip(self.joints, frames, strict=True):
+            leader, factor = (each.name, 1.0) if each.mimic is None else each.mimic[:2]
+            if each.kind is JointType.FIXED or leader not in free:
+                continue
+            axis = np.array(rotated(at.orientation, each.axis))
+            if each.kind is JointType.PRISMATIC:
+                jacobian[:3, free[leader]] += factor * axis
+            else:
+                arm = [to - start for to, start in zip(tool.position, at.position, strict=True)]
+                turn = {Held.ALL: axis, Held.AHEAD: axis - ahead * (ahead @ axis), Held.NONE: 0.0 * axis}[held]
+                jacobian[:, free[leader]] += factor * np.concatenate([np.cross(axis, arm), turn])
+        return np.array(_difference(tool, self.goal, held)), jacobian
 
 
 def _difference(tool: Pose, goal: Pose, held: Held) -> list[float]:
@@ -538,10 +514,7 @@ def _solver(joints: Sequence[Joint], ranges: Sequence[Bounds]) -> optik.Robot:
     The library supports no continuous joint: each becomes a revolute one with its range. The library leaves out fixed
     joints: each is made part of the next movable joint.
     """
-    robot = Element("robot", name="chain")
-    SubElement(robot, "link", name="link 0")
-    fixed: list[Joint] = []
-    number = 0
+    lines, fixed, number = ["<robot name='chain'>", "<link name='0'/>"], list[Joint](), 0
     for each in joints:
         if each.kind is JointType.FIXED:
             fixed.append(each)
@@ -551,20 +524,14 @@ def _solver(joints: Sequence[Joint], ranges: Sequence[Bounds]) -> optik.Robot:
             origin = along(fixed, {}) @ each.origin
             rpy = _rpy(origin)
             fixed.clear()
-        lower, upper = ranges[number]
+        parent, child = f"{number}", f"{number + 1}"
+        joint = Joint(child, JointType.REVOLUTE, parent, child, origin, rpy, each.axis, ranges[number])
+        lines += [f"<link name='{child}'/>", *joint_lines(joint)]
         number += 1
-        SubElement(robot, "link", name=f"link {number}")
-        kind = "prismatic" if each.kind is JointType.PRISMATIC else "revolute"
-        joint = SubElement(robot, "joint", name=f"joint {number}", type=kind)
-        SubElement(joint, "parent", link=f"link {number - 1}")
-        SubElement(joint, "child", link=f"link {number}")
-        SubElement(joint, "origin", xyz=_text(origin.position), rpy=_text(rpy))
-        SubElement(joint, "axis", xyz=_text(each.axis))
-        SubElement(joint, "limit", lower=repr(lower), upper=repr(upper), effort="1", velocity="1")
     with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
-        file.write(tostring(robot, encoding="unicode"))
+        file.write("\n".join([*lines, "</robot>"]))
         file.flush()
-        solver: optik.Robot = _optik().Robot.from_urdf_file(file.name, "link 0", f"link {number}")
+        solver: optik.Robot = _optik().Robot.from_urdf_file(file.name, "0", f"{number}")
     solver.set_parallelism(1)
     return solver
 
@@ -585,7 +552,3 @@ def _rpy(pose: Pose) -> tuple[float, float, float]:
     if flat < _PARALLEL:  # roll and yaw turn about one axis: let roll be 0
         return 0.0, math.atan2(-zx, flat), math.atan2(-xy, yy)
     return math.atan2(zy, zz), math.atan2(-zx, flat), math.atan2(yx, xx)
-
-
-def _text(numbers: Sequence[float]) -> str:
-    return " ".join(map(repr, map(float, numbers)))

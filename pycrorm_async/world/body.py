@@ -12,7 +12,7 @@ joint above the base moves the base, and the root keeps its pose.
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,6 @@ from pycrorm_async.world import pose as poses
 from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, Solid, box_around, rotation_matrix, solids_of
 from pycrorm_async.world.engines import Color, Engine
 from pycrorm_async.world.urdf_model import Joint, Model, along
-
-_AT_ORIGIN: Frame = (poses.Vector(0.0, 0.0, 0.0), poses.IDENTITY)
 
 
 class Body:
@@ -141,18 +139,6 @@ class Body:
         frames = self._engine.frames(self.number, shaped) if shaped else []
         return box_around((frame, self.solids[link]) for link, frame in zip(shaped, frames, strict=True))
 
-    def box_in_link(self, link: str) -> BoundingBox | None:
-        """Return the box along the axes of the link's own frame around its shapes; None if it has none."""
-        return box_around([(_AT_ORIGIN, self.solids[link])])
-
-    def label(self, text: str) -> None:
-        """Show a text at the origin of the root link, in a window only."""
-        self._engine.label(self.number, text)
-
-    def unload(self) -> None:
-        """Remove the body from the engine; pose and positions stay readable."""
-        self._engine.unload(self.number)
-
     def _frame(self, link: str) -> Frame:
         if link == self.root:
             return self.root_pose.position, self.root_pose.orientation
@@ -187,28 +173,13 @@ def inner_points(body: Body) -> list[list[float]]:
 
 def check_arguments(name: object, object_type: object, mass_kg: object, color: Iterable[Any] | None) -> None:
     """Raise `ObjectRefused` for an argument of an object that is none."""
-    _check_identity(name, object_type)
-    _check_mass(name, mass_kg)
-    _check_color(name, color)
-
-
-def _check_identity(name: object, object_type: object) -> None:
-    """Raise `ObjectRefused` unless both have the right type; every record of an object holds them."""
     if not isinstance(name, str):
         raise poses.ObjectRefused(f"an object's name must be a str, got {name!r}")
     if not isinstance(object_type, poses.ObjectType):
         raise poses.ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
-
-
-def _check_mass(name: object, mass_kg: object) -> None:
-    """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
     if mass_kg is not None and not 0 < number_or_nan(mass_kg) < math.inf:
         raise poses.ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r:.100}")
-
-
-def _check_color(name: object, color: Iterable[Any] | None) -> None:
-    """Raise `ObjectRefused` unless the color is None or four numbers; an engine would ignore another."""
-    try:
+    try:  # an engine would ignore another color
         is_color = color is None or len([float(each) for each in color]) == 4
     except (TypeError, ValueError, OverflowError):
         is_color = False
@@ -249,13 +220,6 @@ class WorldState:
     objects: Mapping[str, ObjectState]
 
 
-class StateChange(NamedTuple):
-    """The differences that setting a state made: the joints that got another position, and whether the pose changed."""
-
-    joints: dict[str, float]
-    moved: bool
-
-
 def check_state(name: str, body: Body, state: ObjectState) -> None:
     """Raise `UnknownJoint`, `PoseRefused` or `JointLimitExceeded` if the body of that object cannot take this state."""
     if not all(map(math.isfinite, (*state.pose.position, *state.pose.orientation))):
@@ -267,12 +231,15 @@ def check_state(name: str, body: Body, state: ObjectState) -> None:
             raise poses.JointLimitExceeded(name, joint, position, body.limits[joint])
 
 
-def set_state(body: Body, state: ObjectState) -> StateChange:
-    """Set pose and joint positions of a body, and return what has changed; followers follow, whatever was saved."""
+def set_state(body: Body, pose: poses.Pose, joints: Mapping[str, float]) -> tuple[dict[str, float], bool]:
+    """Set pose and joint positions of a body, those of followers too.
+
+    Returns the joints that got another position, and whether the pose has changed.
+    """
     before = body.pose
-    joints = {joint: value for joint, value in body.followed(state.joints).items() if body.positions[joint] != value}
-    if joints:
-        body.turn(joints)
-    if body.pose != state.pose:
-        body.place(state.pose)
-    return StateChange(joints, body.pose != before)
+    turned = {joint: value for joint, value in joints.items() if body.positions[joint] != value}
+    if turned:
+        body.turn(turned)
+    if body.pose != pose:
+        body.place(pose)
+    return turned, body.pose != before

@@ -133,6 +133,18 @@ def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox |
     return BoundingBox(Vector(*stacked.min(axis=0).tolist()), Vector(*stacked.max(axis=0).tolist()))
 
 
+def boxes_around(turns: Array, positions: Array, middles: Array, halves: Array) -> tuple[Array, Array]:
+    """Return the lowest and the highest corners of the boxes around boxes of frames, (n, 3) each.
+
+    Args:
+        turns, positions: the frames, (n, 3, 3) and (n, 3).
+        middles, halves: of the boxes in their frames: the centre and half of the edges, (n, 3).
+    """
+    centres = positions + np.einsum("nij,nj->ni", turns, middles)
+    reaches = np.einsum("nij,nj->ni", np.abs(turns), halves)
+    return centres - reaches, centres + reaches
+
+
 def rotation_matrix(turn: Sequence[float]) -> Array:
     """Return the rotation matrix of a unit quaternion xyzw, shape (3, 3)."""
     x, y, z, w = turn

@@ -21,7 +21,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, ClassVar, Protocol, Self, TypeVar
 
 from pycrorm_async import connected_var
 from pycrorm_async.connected_var import ConnectedVar
@@ -36,7 +36,7 @@ from pycrorm_async.world.body import (
     number_or_nan,
     set_state,
 )
-from pycrorm_async.world.bounding_boxes import BoundingBox
+from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.engines import Color, Engine, engine_class
 from pycrorm_async.world.model_boxes import shape_boxes
 from pycrorm_async.world.models import built_in_urdf
@@ -45,6 +45,8 @@ from pycrorm_async.world.urdf_model import Model, read_model, urdf_text
 
 if TYPE_CHECKING:
     from pycrorm_async.world.arms import Chain
+
+T = TypeVar("T")
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -222,7 +224,7 @@ class BulletWorld:
         """Detach an object and remove it; its last pose and joints can still be read."""
         obj.check_present()
         obj.detach_all()
-        obj.body.unload()
+        self.engine.unload(obj.body.number)
         del self._objects[obj.body.number]
         if obj is self._robot:
             robots = (other for other in self._objects.values() if other.object_type is poses.ObjectType.ROBOT)
@@ -269,11 +271,13 @@ class BulletWorld:
                 attached_to = states[each.child].attached_to if each.child in states else None
                 if attached_to != (each.parent.name, each.link):
                     each.parent.detach(each.child)
-        changes = {obj: set_state(obj.body, state) for obj, state in states.items()}
-        for obj, change in changes.items():
-            if change.joints:
-                self.notify_joints(obj, change.joints)
-        self.notify_moved([obj for obj, change in changes.items() if change.moved])
+        changes = {  # followers follow, whatever was saved
+            obj: set_state(obj.body, state.pose, obj.body.followed(state.joints)) for obj, state in states.items()
+        }
+        for obj, (joints, _) in changes.items():
+            if joints:
+                self.notify_joints(obj, joints)
+        self.notify_moved([obj for obj, (_, has_moved) in changes.items() if has_moved])
         for child, state in states.items():
             if state.attached_to is not None:
                 parent, link = self.object(state.attached_to[0]), state.attached_to[1]
@@ -620,7 +624,7 @@ class Object:
 
     def box_in_link(self, link: str) -> BoundingBox | None:
         """Return the box around a link's collision shapes, in its own frame; None without any. Raises `UnknownLink`."""
-        return self.body.box_in_link(self._check_link(link))
+        return box_around([((poses.Vector(0.0, 0.0, 0.0), poses.IDENTITY), self.body.solids[self._check_link(link)])])
 
     def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:
         """Return the boxes around the visual shapes of links, in their frames, where the shapes can be read."""
@@ -640,7 +644,7 @@ class Object:
     def label(self, text: str) -> None:
         """Show a text at the object, if the world has a window."""
         self.check_present()
-        self.body.label(text)
+        self.world.engine.label(self.body.number, text)
 
     # --- joints -----------------------------------------------------------------------------------------------
 
@@ -656,10 +660,7 @@ class Object:
 
     def joint_position(self, joint: str) -> float:
         """Return the position that was set last, rad or m. Raises `UnknownJoint`."""
-        try:
-            return self.body.positions[joint]
-        except KeyError:
-            raise poses.UnknownJoint(self.name, joint, self.joints) from None
+        return self._of_joint(joint, self.body.positions)
 
     def joint_positions(self) -> dict[str, float]:
         """Return the positions of all movable joints by name, rad or m; a copy."""
@@ -667,17 +668,11 @@ class Object:
 
     def joint_limits(self, joint: str) -> tuple[float, float]:
         """Return the lower and upper hard limit, rad or m; infinite for a continuous joint. Raises `UnknownJoint`."""
-        try:
-            return self.body.limits[joint]
-        except KeyError:
-            raise poses.UnknownJoint(self.name, joint, self.joints) from None
+        return self._of_joint(joint, self.body.limits)
 
     def joint_type(self, joint: str) -> poses.JointType:
         """Return the type of a joint, also of a fixed one. Raises `UnknownJoint`."""
-        try:
-            return self.body.joint_types[joint]
-        except KeyError:
-            raise poses.UnknownJoint(self.name, joint, self.joints) from None
+        return self._of_joint(joint, self.body.joint_types)
 
     def joints_above(self, link: str | None) -> tuple[str, ...]:
         """Return the movable joints between a link (None: the base link) and the root, nearest first.
@@ -778,15 +773,10 @@ class Object:
         """
         self.check_present()
         self.detach_all()
-        joints = {joint: start for joint, start in self.body.start.items() if self.body.positions[joint] != start}
-        before = self.body.pose
-        if joints:
-            self.body.turn(joints)
-        if self.body.pose != self.original_pose:
-            self.body.place(self.original_pose)
+        joints, has_moved = set_state(self.body, self.original_pose, self.body.start)
         if joints:
             self.world.notify_joints(self, joints)
-        if self.body.pose != before:
+        if has_moved:
             self.world.notify_moved([self])
 
     def remove(self) -> None:
@@ -804,6 +794,12 @@ class Object:
         attachments = self.world.attachments
         if (attachment := attachments.of(self)) is not None:
             attachments.put(attachment.parent, self, attachment.link)
+
+    def _of_joint(self, joint: str, values: Mapping[str, T]) -> T:
+        try:
+            return values[joint]
+        except KeyError:
+            raise poses.UnknownJoint(self.name, joint, self.joints) from None
 
     def _check_link(self, link: str) -> str:
         if link not in self.body.movable_above:

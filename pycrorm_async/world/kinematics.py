@@ -111,12 +111,31 @@ def postures(
     if description is None:
         raise CallerError(f"{robot.name!r} has no robot description, so its arms are unknown")
     root = robot.root_pose(base)
-    if not isinstance(description, PR2Description):
-        yield from _chain_postures(robot, description, arm, target, root, torso_height, limits, starts)
+    if isinstance(description, PR2Description):
+        height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
+        narrower = robot.joint_limits if limits is Limits.HARD else None
+        yield solve_from(description, arm, target, base=root, torso_height=height, limits=limits, narrower=narrower)
         return
-    height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
-    narrower = robot.joint_limits if limits is Limits.HARD else None
-    yield solve_from(description, arm, target, base=root, torso_height=height, limits=limits, narrower=narrower)
+    arm_description = _one_arm(description.arms, description, arm)
+    _check(target, root)
+    chain = chain_of(robot, arm)
+    positions = robot.joint_positions()
+    if torso_height is not None and description.torso_joint is not None:
+        positions[description.torso_joint] = torso_height
+    goal = target.relative_to(root)
+    point, reach_m = chain.held_point(goal)
+    distance = math.dist(chain.first_joint(positions), point)
+    if distance > reach_m:
+        raise Unreachable(target, arm, f"too far: {distance:.3f} m from its first joint, it reaches {reach_m:.3f} m")
+    is_reached = False
+    for joints in chain.postures(goal, positions, _chain_bounds(chain, arm_description, limits), starts):
+        reached = chain.forward(positions | joints)
+        turned = _angle_between(reached.orientation, goal.orientation) if chain.held is Held.ALL else 0.0
+        if reached.distance(goal) <= EXACT_M and turned <= EXACT_RAD:
+            is_reached = True
+            yield joints
+    if not is_reached:
+        raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
 
 
 def solve_from(
@@ -141,44 +160,24 @@ def solve_from(
     True
     """
     arm_description = _one_arm(description.arms, description, arm)
-    bounds = _bounds(arm_description, limits)
-    if narrower is not None:
-        bounds = [_narrow(each, narrower(name)) for name, each in zip(arm_description.joints, bounds, strict=True)]
+    bounds = _bounds(arm_description, limits, narrower)
     reach = _reach(description, arm_description, target, root=base, torso_height=torso_height)
-    return _solve(arm_description, arm, target, reach, bounds, limits)
-
-
-def _chain_postures(
-    robot: Object,
-    description: RobotDescription,
-    arm: Arms,
-    target: Pose,
-    root: Pose,
-    torso_height: float | None,
-    limits: Limits,
-    starts: int,
-) -> Iterator[dict[str, float]]:
-    """Yield the postures of a robot without a closed form, whose root link is at `root`."""
-    arm_description = _one_arm(description.arms, description, arm)
-    _check(target, root)
-    chain = chain_of(robot, arm)
-    positions = robot.joint_positions()
-    if torso_height is not None and description.torso_joint is not None:
-        positions[description.torso_joint] = torso_height
-    goal = target.relative_to(root)
-    point, reach_m = chain.held_point(goal)
-    distance = math.dist(chain.first_joint(positions), point)
-    if distance > reach_m:
-        raise Unreachable(target, arm, f"too far: {distance:.3f} m from its first joint, it reaches {reach_m:.3f} m")
-    is_reached = False
-    for joints in chain.postures(goal, positions, _chain_bounds(chain, arm_description, limits), starts):
-        reached = chain.forward(positions | joints)
-        turned = _angle_between(reached.orientation, goal.orientation) if chain.held is Held.ALL else 0.0
-        if reached.distance(goal) <= EXACT_M and turned <= EXACT_RAD:
-            is_reached = True
-            yield joints
-    if not is_reached:
-        raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
+    windows = arm_ik.pan_windows(arm_description, reach.wrist, bounds)
+    if not windows:
+        raise Unreachable(target, arm, _why_no_pan(arm_description, reach.wrist, bounds, limits))
+    pans = np.concatenate([_steps(window, PAN_STEP_RAD) for window in windows])
+    upper, margin = _best(arm_description, reach, pans, bounds)
+    if -NEAR_MISS_RAD < margin < 0:
+        around = _narrow(bounds[arm_ik.PAN], (upper[0] - PAN_STEP_RAD, upper[0] + PAN_STEP_RAD))
+        upper, margin = _best(arm_description, reach, _steps(around, PAN_STEP_RAD / 50), bounds)
+    angles = [*upper, *arm_ik.wrist_angles(upper, reach.turn)]
+    if margin < -arm_ik.ROUNDING:
+        raise Unreachable(target, arm, _why_no_posture(arm_description, angles, bounds, limits))
+    angles = [min(max(angle, lower), upper) for angle, (lower, upper) in zip(angles, bounds, strict=True)]
+    tool, turn = arm_ik.hand(arm_description, angles)
+    if math.dist(tool, reach.tool) > EXACT_M or _angle_between(turn, reach.turn) > EXACT_RAD:
+        raise Unreachable(target, arm, "the target is at the limit of the arm's reach, less than 1e-6 m away from it")
+    return dict(zip(arm_description.joints, angles, strict=True))
 
 
 def within_reach(
@@ -199,9 +198,7 @@ def within_reach(
     ranges, offset, firsts = (0.0, math.inf), 0.0, []
     if isinstance(description, PR2Description):
         described = _one_arm(description.arms, description, arm)
-        bounds, names = _bounds(described, limits), described.joints
-        if limits is Limits.HARD:
-            bounds = [_narrow(each, robot.joint_limits(name)) for name, each in zip(names, bounds, strict=True)]
+        bounds = _bounds(described, limits, robot.joint_limits if limits is Limits.HARD else None)
         ranges, offset = arm_ik.stretches_m(described, bounds), described.shoulder_offset_m
         wrists = [(each @ Pose((-described.tool_m, 0.0, 0.0))).position for each in targets]
         now = robot.joint_position(description.torso_joint)
@@ -292,26 +289,6 @@ def _chain_bounds(chain: Chain, described: ArmDescription, limits: Limits) -> di
     return bounds
 
 
-def _solve(
-    arm_description: PR2Arm, arm: Arms, target: Pose, reach: Reach, bounds: Sequence[Bounds], limits: Limits
-) -> dict[str, float]:
-    windows = arm_ik.pan_windows(arm_description, reach.wrist, bounds)
-    if not windows:
-        raise Unreachable(target, arm, _why_no_pan(arm_description, reach.wrist, bounds, limits))
-    pans = np.concatenate([_steps(window, PAN_STEP_RAD) for window in windows])
-    upper, margin = _best(arm_description, reach, pans, bounds)
-    if -NEAR_MISS_RAD < margin < 0:
-        around = _narrow(bounds[arm_ik.PAN], (upper[0] - PAN_STEP_RAD, upper[0] + PAN_STEP_RAD))
-        upper, margin = _best(arm_description, reach, _steps(around, PAN_STEP_RAD / 50), bounds)
-    angles = [*upper, *arm_ik.wrist_angles(upper, reach.turn)]
-    if margin < -arm_ik.ROUNDING:
-        raise Unreachable(target, arm, _why_no_posture(arm_description, angles, bounds, limits))
-    angles = [min(max(angle, lower), upper) for angle, (lower, upper) in zip(angles, bounds, strict=True)]
-    if not _leads_to(arm_description, angles, reach):
-        raise Unreachable(target, arm, "the target is at the limit of the arm's reach, less than 1e-6 m away from it")
-    return dict(zip(arm_description.joints, angles, strict=True))
-
-
 def _best(arm_description: PR2Arm, reach: Reach, pans: Floats, bounds: Sequence[Bounds]) -> tuple[list[float], float]:
     """Return pan, lift, roll and elbow of the posture with the largest margin, and that margin."""
     curve = arm_ik.curve(arm_description, reach, pans, bounds)
@@ -325,12 +302,6 @@ def _steps(window: Bounds, step: float) -> Floats:
     return np.linspace(*window, max(2, 1 + math.ceil((window.upper - window.lower) / step)))
 
 
-def _leads_to(arm_description: PR2Arm, angles: Sequence[float], reach: Reach) -> bool:
-    tool, turn = arm_ik.hand(arm_description, angles)
-    expected = [at + arm_description.tool_m * along for at, along in zip(reach.wrist, reach.ahead, strict=True)]
-    return math.dist(tool, expected) <= EXACT_M and _angle_between(turn, reach.turn) <= EXACT_RAD
-
-
 def _reach(
     description: PR2Description, arm_description: PR2Arm, target: Pose, *, root: Pose, torso_height: float
 ) -> Reach:
@@ -341,7 +312,10 @@ def _reach(
     from_root = rotated(back, [a - b for a, b in zip(target.position, root.position, strict=True)])
     shoulder = _shoulder(description, arm_description, torso_height)
     tool = Vector(*(a - b for a, b in zip(from_root, shoulder, strict=True)))
-    return arm_ik.reach(arm_description, tool, product(back, target.orientation))
+    turn = product(back, target.orientation)
+    ahead = rotated(turn, (1.0, 0.0, 0.0))
+    wrist = Vector(*(at - arm_description.tool_m * along for at, along in zip(tool, ahead, strict=True)))
+    return Reach(tool, wrist, turn, ahead)
 
 
 def _shoulder(description: PR2Description, arm_description: PR2Arm, torso_height: float) -> Vector:
@@ -394,10 +368,15 @@ def _check(target: Pose, root: Pose) -> None:
         raise CallerError(f"the target is not finite: {target!r}")
 
 
-def _bounds(arm_description: PR2Arm, limits: Limits) -> list[Bounds]:
-    """Return the limits in the order of the joints."""
+def _bounds(
+    arm_description: PR2Arm, limits: Limits, narrower: Callable[[str], tuple[float, float]] | None
+) -> list[Bounds]:
+    """Return the limits in the order of the joints, narrowed by those of a loaded model."""
     by_name = arm_description.limits(limits)
-    return [by_name[name] for name in arm_description.joints]
+    bounds = [by_name[name] for name in arm_description.joints]
+    if narrower is None:
+        return bounds
+    return [_narrow(each, narrower(name)) for name, each in zip(arm_description.joints, bounds, strict=True)]
 
 
 def _narrow(bound: Bounds, model: tuple[float, float]) -> Bounds:

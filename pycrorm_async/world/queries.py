@@ -29,14 +29,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.world.bounding_boxes import BoundingBox, Solid, box_around
+from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.engines import FLOOR, SKY, Floats, Part
 from pycrorm_async.world.engines import Camera as Camera  # one of the names of this module
@@ -75,18 +74,7 @@ def collisions_at(
     carried = tuple(carried)
     parts = [Part(robot.body.number, link) for link in links] + [Part(obj.body.number) for obj in carried]
     names = [*links, *(obj.name for obj in carried)]
-    with _moved(robot, positions, carried, robot.pose if base is None else base):
-        near = world.engine.nearest(parts, others, 0.0)
-    collisions = {(each.other, each.part) for each in near if each.distance_m < -TOUCH_M}
-    return [
-        (names[part], obj) for other, obj in others.items() for part in range(len(parts)) if (other, part) in collisions
-    ]
-
-
-@contextmanager
-def _moved(robot: Object, positions: Mapping[str, float], carried: Iterable[Object], base: Pose) -> Iterator[None]:
-    """Move the robot and the carried objects in Bullet, and restore them at the end of the context."""
-    body, original_base = robot.body, robot.pose
+    body, original_base, base = robot.body, robot.pose, robot.pose if base is None else base
     original_positions = {joint: body.positions[joint] for joint in positions}
     originals = [(obj, obj.pose, robot.attachments[obj]) for obj in carried]
     relative_poses = [pose.relative_to(robot.link_pose(link)) for _, pose, link in originals]
@@ -97,7 +85,7 @@ def _moved(robot: Object, positions: Mapping[str, float], carried: Iterable[Obje
             body.place(base)
         for (obj, _, link), relative_pose in zip(originals, relative_poses, strict=True):
             obj.body.place(robot.link_pose(link) @ relative_pose)
-        yield
+        near = world.engine.nearest(parts, others, 0.0)
     finally:
         if original_positions:
             body.turn(original_positions)
@@ -105,6 +93,10 @@ def _moved(robot: Object, positions: Mapping[str, float], carried: Iterable[Obje
             body.place(original_base)
         for obj, pose, _ in originals:
             obj.body.place(pose)
+    collisions = {(each.other, each.part) for each in near if each.distance_m < -TOUCH_M}
+    return [
+        (names[part], obj) for other, obj in others.items() for part in range(len(parts)) if (other, part) in collisions
+    ]
 
 
 # === costmaps =================================================================================================
@@ -367,14 +359,14 @@ class Obstacles:
 
     def __init__(self, world: BulletWorld, *, ignore: Iterable[Object] | None = None) -> None:
         ignored = ignored_objects(world, ignore)
-        outlines = [
-            (obj.name, link, heading, _outline(frame, solid, heading))
-            for obj in world.objects
-            if obj not in ignored
-            for link, frame, heading in _shaped_links(obj)
-            for solid in obj.body.solids[link]
-        ]
-        outlines = [each for each in outlines if is_obstacle(each[3])]
+        outlines: list[tuple[str, str, float, BoundingBox]] = []
+        for obj in (each for each in world.objects if each not in ignored):
+            for link in (each for each in obj.links if obj.body.solids[each]):
+                frame = obj.link_pose(link)
+                heading, back = frame.yaw, yaw_quaternion(-frame.yaw)
+                turned = rotated(back, frame.position), product(back, frame.orientation)
+                boxes = (box_around([(turned, [solid])]) for solid in obj.body.solids[link])
+                outlines += [(obj.name, link, heading, box) for box in boxes if box is not None and is_obstacle(box)]
         self._names = [(name, link) for name, link, _, _ in outlines]
         self._headings = np.array([heading for _, _, heading, _ in outlines])
         lows = np.array([box.min[:2] for *_, box in outlines]).reshape(-1, 2)
@@ -418,21 +410,6 @@ class Obstacles:
         return Costmap(values, origin, resolution_m=resolution_m)
 
 
-def _shaped_links(obj: Object) -> Iterator[tuple[str, Pose, float]]:
-    for link in obj.links:
-        if obj.body.solids[link]:
-            frame = obj.link_pose(link)
-            yield link, frame, frame.yaw
-
-
-def _outline(frame: Pose, solid: Solid, heading: float) -> BoundingBox:
-    """Return the box around the solid in axes that are turned by the heading about the map's origin."""
-    back = yaw_quaternion(-heading)
-    box = box_around([((rotated(back, frame.position), product(back, frame.orientation)), [solid])])
-    assert box is not None, "the box around one solid"
-    return box
-
-
 def _turned(points: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate the points, shape (..., 2), about the origin."""
     cos, sin = np.cos(angles), np.sin(angles)
@@ -471,15 +448,10 @@ def photograph(world: BulletWorld, camera: Camera, width: int, height: int, *, s
     """
     scale = 2 if smooth else 1
     image = world.engine.render(camera, width * scale, height * scale, shadows=smooth)
-    pixels = image.colors
-    _repaint_ground(pixels, image.bodies)
+    pixels, floor = image.colors, image.bodies == FLOOR
+    pixels[image.bodies == SKY] = _SKY
+    brightness = pixels[floor].mean(axis=1, keepdims=True)
+    pixels[floor] = _FLOOR_LIGHT + (brightness - _FLOOR_LIGHT) * _FLOOR_CONTRAST
     smoothed = pixels.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
     numbers, depths = image.bodies[::scale, ::scale], image.depths[::scale, ::scale]
     return Photograph(smoothed.round().astype(np.uint8), numbers, depths)
-
-
-def _repaint_ground(pixels: Floats, bodies: NDArray[np.int32]) -> None:
-    pixels[bodies == SKY] = _SKY
-    floor = bodies == FLOOR
-    brightness = pixels[floor].mean(axis=1, keepdims=True)
-    pixels[floor] = _FLOOR_LIGHT + (brightness - _FLOOR_LIGHT) * _FLOOR_CONTRAST

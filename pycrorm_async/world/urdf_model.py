@@ -198,6 +198,32 @@ def origin(xyz: Sequence[float], rpy: Sequence[float]) -> poses.Pose:
     )
 
 
+# === writing ==================================================================================================
+
+
+def joint_lines(joint: Joint) -> list[str]:
+    """Return the element of a joint, without <mimic>, a tag a line.
+
+    A revolute joint without limits is continuous; other infinite limits are `COORDINATE_MAX`.
+    """
+    lower, upper = (min(max(each, -poses.COORDINATE_MAX), poses.COORDINATE_MAX) for each in joint.bounds)
+    endless = joint.kind is poses.JointType.REVOLUTE and math.isinf(joint.bounds.upper - joint.bounds.lower)
+    return [
+        f"<joint name={quoteattr(joint.name)} type='{'continuous' if endless else joint.kind.name.lower()}'>",
+        f"<parent link={quoteattr(joint.parent)}/>",
+        f"<child link={quoteattr(joint.child)}/>",
+        f"<origin xyz='{digits(joint.origin.position)}' rpy='{digits(joint.rpy)}'/>",
+        f"<axis xyz='{digits(joint.axis)}'/>",
+        f"<limit lower='{lower!r}' upper='{upper!r}' effort='100' velocity='3'/>",
+        "</joint>",
+    ]
+
+
+def digits(numbers: Sequence[float]) -> str:
+    """Return the numbers with all their digits, as an attribute has them."""
+    return " ".join(repr(float(each)) for each in numbers)
+
+
 # === files ====================================================================================================
 
 

@@ -15,8 +15,11 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from typing import NamedTuple, Protocol, TypeAlias
 
@@ -221,6 +224,15 @@ def engine_in(description: str) -> str | None:
     """Return the name and version of the engine in the description of a world; None if it has none."""
     match = re.match(r"BulletWorld \(\w+, ([^)]+)\):", description)
     return None if match is None else match[1]
+
+
+@cache
+def title_of(engine: str, *packages: str) -> str:
+    """Return the engine's name with the version of the first of these packages that is installed."""
+    for package in packages:
+        with suppress(PackageNotFoundError):
+            return f"{engine} {version(package)}"
+    return engine
 
 
 def _is_installed(name: str) -> bool:

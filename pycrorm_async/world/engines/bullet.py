@@ -7,15 +7,15 @@ Bullet makes the hulls of meshes 1 mm thicker, and rounds the corners of boxes b
 """
 
 import ctypes
+import itertools
 import math
 import os
 import re
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache, cached_property
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
@@ -25,10 +25,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from pycrorm_async.world import pose as poses
-from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, box_of, rotation_matrix
-from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of
+from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, box_of, boxes_around, rotation_matrix
+from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of, title_of
 from pycrorm_async.world.meshes import for_bullet
-from pycrorm_async.world.urdf_model import Model, Shape, along
+from pycrorm_async.world.urdf_model import Model, along, digits, joint_lines
 
 _ROOT = -1  # Bullet's number of a body's first link
 _STATES_MAX = 127
@@ -99,7 +99,8 @@ class Bullet:
     @classmethod
     def title(cls) -> str:
         """Return "Bullet" and the version of the installed package."""
-        return _title()
+        installed = [packages for module, packages in _PACKAGES.items() if find_spec(module) is not None]
+        return title_of("Bullet", *itertools.chain.from_iterable(installed))
 
     def close(self) -> None:
         """Close the client."""
@@ -150,7 +151,7 @@ class Bullet:
             return [frame_of(each.position, each.orientation) for each in placed]
         if len(links) == 1 and (only := body.links[links[0]]) != _ROOT:
             state = self._bullet.getLinkState(number, only, computeForwardKinematics=True, physicsClientId=self.client)
-            return [_frame(state)]
+            return [frame_of(*state[:2])]
         numbers = [body.links[link] for link in links]
         below = [each for each in numbers if each != _ROOT]
         states: Sequence[Any] = ()
@@ -158,7 +159,7 @@ class Bullet:
             states = self._bullet.getLinkStates(
                 number, below, computeForwardKinematics=True, physicsClientId=self.client
             )
-        frames = {each: _frame(state) for each, state in zip(below, states, strict=True)}
+        frames = {each: frame_of(*state[:2]) for each, state in zip(below, states, strict=True)}
         frames[_ROOT] = frame_of(body.root.position, body.root.orientation)
         return [frames[each] for each in numbers]
 
@@ -217,10 +218,9 @@ class Bullet:
             frames = self.frames(number, [*body.boxes])
             corners = np.array([(box.min, box.max) for box in body.boxes.values()]).reshape(-1, 2, 3)
             turns = np.array([rotation_matrix(turn) for _, turn in frames]).reshape(-1, 3, 3)
-            middles = np.einsum("nij,nj->ni", turns, corners.mean(axis=1))
-            middles += np.array([position for position, _ in frames]).reshape(-1, 3)
-            halves = np.einsum("nij,nj->ni", np.abs(turns), np.ptp(corners, axis=1) / 2)
-            body.placed_boxes = middles - halves, middles + halves
+            positions = np.array([position for position, _ in frames]).reshape(-1, 3)
+            halves = np.ptp(corners, axis=1) / 2
+            body.placed_boxes = boxes_around(turns, positions, corners.mean(axis=1), halves)
         return body.placed_boxes
 
     def first_met(
@@ -228,28 +228,23 @@ class Bullet:
     ) -> list[int]:
         """Return the first body on every ray."""
         numbers: list[int] = []
-        with self._without_collisions(transparent):
+        try:
+            for number in transparent:
+                self._group(number, 0)
             for begin in range(0, len(starts), _RAYS_AT_ONCE):
                 rays = starts[begin : begin + _RAYS_AT_ONCE], ends[begin : begin + _RAYS_AT_ONCE]
                 numbers += [hit[0] for hit in self._bullet.rayTestBatch(*rays, physicsClientId=self.client)]
+        finally:
+            for number in transparent:
+                self._group(number, 1)
         return numbers
 
-    @contextmanager
-    def _without_collisions(self, transparent: Collection[int]) -> Iterator[None]:
-        """Let rays pass through these bodies inside the context, by removing them from all of Bullet's groups.
+    def _group(self, number: int, group: int) -> None:
+        """Put a body into a group of Bullet; rays pass through those in none.
 
         Casting a new ray from behind each hit would not work: Bullet may let a ray that starts just inside a shape hit
         the same shape again and again.
         """
-        try:
-            for number in transparent:
-                self._group(number, 0)
-            yield
-        finally:
-            for number in transparent:
-                self._group(number, 1)
-
-    def _group(self, number: int, group: int) -> None:
         for link in self._bodies[number].links.values():
             self._bullet.setCollisionFilterGroupMask(number, link, group, -1, physicsClientId=self.client)
 
@@ -286,11 +281,6 @@ class Bullet:
     def label(self, number: int, text: str) -> None:
         """Show a text at the origin of the root link, in a window only."""
         self._bullet.addUserDebugText(text, (0.0, 0.0, 0.03), parentObjectUniqueId=number, physicsClientId=self.client)
-
-
-def _frame(state: Sequence[Any]) -> Frame:
-    """Return the frame of a link's centre of mass, which is in the link's own frame, but in double precision."""
-    return frame_of(state[0], state[1])
 
 
 def _connect(mode: poses.WorldMode) -> int:
@@ -363,54 +353,36 @@ def _written(model: Model, folder: Path) -> tuple[str, tuple[str, ...]]:
                     files[kind, file] = file if content is None else str(folder / f"{len(files)}.stl")
                     if content is not None:
                         Path(files[kind, file]).write_bytes(content)
-                file = files.get((kind, file), "")
+                sizes = _SIZES[shape.kind].format(*map(repr, shape.sizes))
+                name_of_file = f"filename={quoteattr(files[kind, file])} " if shape.kind == "mesh" else ""
                 lines += [
                     f"<{kind}>",
-                    _origin_tag(shape.xyz, shape.rpy),
+                    f"<origin xyz='{digits(shape.xyz)}' rpy='{digits(shape.rpy)}'/>",
                     "<geometry>",
-                    _geometry(shape, file),
+                    f"<{shape.kind} {name_of_file}{sizes}/>",
                     "</geometry>",
                 ]
                 if shape.color is not None and kind == "visual":
-                    rgba = _text(shape.color)
+                    rgba = digits(shape.color)
                     lines.append(f"<material name='{rgba}'>\n<color rgba='{rgba}'/>\n</material>")
                 lines.append(f"</{kind}>")
         lines.append("</link>")
     for joint in model.joints.values():
-        lower, upper = (min(max(each, -poses.COORDINATE_MAX), poses.COORDINATE_MAX) for each in joint.bounds)
-        endless = joint.kind is poses.JointType.REVOLUTE and math.isinf(joint.bounds.upper - joint.bounds.lower)
-        lines += [
-            f"<joint name={quoteattr(joint.name)} type='{'continuous' if endless else joint.kind.name.lower()}'>",
-            f"<parent link={quoteattr(joint.parent)}/>",
-            f"<child link={quoteattr(joint.child)}/>",
-            _origin_tag(joint.origin.position, joint.rpy),
-            f"<axis xyz='{_text(joint.axis)}'/>",
-            f"<limit lower='{lower!r}' upper='{upper!r}' effort='100' velocity='3'/>",
-            "</joint>",
-        ]
+        lines += joint_lines(joint)
     return "\n".join([*lines, "</robot>"]), tuple(remarks)
 
 
 _INERTIAL = "<inertial>\n<mass value='1'/>\n<inertia ixx='1' ixy='0' ixz='0' iyy='1' iyz='0' izz='1'/>\n</inertial>"
 
 
-def _origin_tag(xyz: Sequence[float], rpy: Sequence[float]) -> str:
-    return f"<origin xyz='{_text(xyz)}' rpy='{_text(rpy)}'/>"
-
-
-def _geometry(shape: Shape, file: str) -> str:
-    match shape.kind:
-        case "mesh":
-            return f"<mesh filename={quoteattr(file)} scale='{_text(shape.sizes)}'/>"
-        case "box":
-            return f"<box size='{_text(shape.sizes)}'/>"
-        case "sphere":
-            return f"<sphere radius='{shape.sizes[0]!r}'/>"
-    return f"<{shape.kind} radius='{shape.sizes[0]!r}' length='{shape.sizes[1]!r}'/>"
-
-
-def _text(numbers: Sequence[float]) -> str:
-    return " ".join(map(repr, numbers))
+_SIZES = {
+    "mesh": "scale='{} {} {}'",
+    "box": "size='{} {} {}'",
+    "sphere": "radius='{}'",
+    "cylinder": "radius='{}' length='{}'",
+    "capsule": "radius='{}' length='{}'",
+}
+"""The attributes of each kind of shape."""
 
 
 def _messages(output: str, kind: str) -> list[str]:
@@ -457,15 +429,6 @@ def library() -> Any:
         with captured():
             return import_module(name)
     raise poses.BulletMissing
-
-
-@cache
-def _title() -> str:
-    for module, packages in _PACKAGES.items():
-        for package in packages if find_spec(module) is not None else ():
-            with suppress(PackageNotFoundError):
-                return f"Bullet {version(package)}"
-    return "Bullet"
 
 
 @contextmanager

@@ -24,9 +24,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Collection, Mapping, Sequence
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -35,10 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.world import pose as poses
-from pycrorm_async.world.bounding_boxes import Frame, rotation_matrix
-from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of
-from pycrorm_async.world.meshes import FileStatus, file_status, mesh_points, read_mesh
-from pycrorm_async.world.urdf_model import Joint, Model, Shape, origin
+from pycrorm_async.world.bounding_boxes import Frame, boxes_around, rotation_matrix
+from pycrorm_async.world.engines import FAR_M, FLOOR, SKY, Camera, Color, Floats, Image, Near, Part, frame_of, title_of
+from pycrorm_async.world.meshes import FileStatus, Mesh, file_status, mesh_points, read_mesh
+from pycrorm_async.world.urdf_model import Model, Shape, origin
 
 Numbers: TypeAlias = NDArray[np.int32]
 
@@ -76,7 +75,7 @@ class MuJoCo:
     @classmethod
     def title(cls) -> str:
         """Return "MuJoCo" and the version of the installed package."""
-        return _title()
+        return title_of("MuJoCo", "mujoco-core", "mujoco")
 
     def close(self) -> None:
         """Free the scenes."""
@@ -221,7 +220,7 @@ class _Geom(NamedTuple):
     size: tuple[float, float, float]
     at: poses.Pose
     color: Color
-    mesh: _Triangles | None = None
+    mesh: Mesh | None = None
 
 
 class _Elements(NamedTuple):
@@ -282,49 +281,32 @@ class _Scene:
         self._is_compiled = False
         root = self._spec.worldbody.add_body(mocap=True, explicitinertial=True, mass=1.0, inertia=(1, 1, 1))
         elements = self._elements[number] = _Elements({body.model.root: root}, {}, [], [])
-        for path in body.model.paths.values():
-            if path:
-                self._add_link(elements, path[-1])
-        for link, geoms in shapes.items():
-            for each in geoms:
-                elements.shapes.append((self._add_shape(elements, link, each), link))
-
-    def _add_link(self, elements: _Elements, joint: Joint) -> None:
-        x, y, z, w = joint.origin.orientation
-        link = elements.links[joint.parent].add_body(
-            pos=joint.origin.position, quat=(w, x, y, z), explicitinertial=True, mass=1.0, inertia=(1, 1, 1)
-        )
-        elements.links[joint.child] = link
-        if joint.kind is not poses.JointType.FIXED:
-            kinds = self._library.mjtJoint
-            kind = kinds.mjJNT_SLIDE if joint.kind is poses.JointType.PRISMATIC else kinds.mjJNT_HINGE
-            elements.joints[joint.name] = link.add_joint(type=kind, axis=joint.axis)
-
-    def _add_shape(self, elements: _Elements, link: str, geom: _Geom) -> Any:
-        x, y, z, w = geom.at.orientation
-        mesh = {}
-        if geom.mesh is not None:
-            mesh = {"meshname": self._mesh_name(elements, geom.mesh)}
-        return elements.links[link].add_geom(
-            type=getattr(self._library.mjtGeom, f"mjGEOM_{geom.kind.upper()}"),
-            size=geom.size,
-            pos=geom.at.position,
-            quat=(w, x, y, z),
-            rgba=geom.color,
-            contype=0,
-            conaffinity=0,
-            **mesh,
-        )
-
-    def _mesh_name(self, elements: _Elements, triangles: _Triangles) -> str:
-        """Return the name of a mesh that all shapes of these triangles share."""
-        name = f"{id(triangles)}"
-        mesh, count = self._meshes.get(id(triangles), (None, 0))
-        if mesh is None:
-            mesh = _add_mesh(self._spec, name, triangles.vertices, triangles.faces)
-        self._meshes[id(triangles)] = mesh, count + 1
-        elements.meshes.append(triangles)
-        return name
+        kinds = self._library.mjtJoint
+        for joint in (path[-1] for path in body.model.paths.values() if path):
+            elements.links[joint.child] = element = elements.links[joint.parent].add_body(
+                **_at(joint.origin), explicitinertial=True, mass=1.0, inertia=(1, 1, 1)
+            )
+            if joint.kind is not poses.JointType.FIXED:
+                kind = kinds.mjJNT_SLIDE if joint.kind is poses.JointType.PRISMATIC else kinds.mjJNT_HINGE
+                elements.joints[joint.name] = element.add_joint(type=kind, axis=joint.axis)
+        for link, geom in ((link, each) for link, geoms in shapes.items() for each in geoms):
+            mesh = {}
+            if geom.mesh is not None:  # which all shapes of these triangles share
+                own, count = self._meshes.get(id(geom.mesh), (None, 0))
+                own = own or _add_mesh(self._spec, f"{id(geom.mesh)}", geom.mesh.vertices, geom.mesh.faces)
+                self._meshes[id(geom.mesh)] = own, count + 1
+                elements.meshes.append(geom.mesh)
+                mesh = {"meshname": f"{id(geom.mesh)}"}
+            shape = elements.links[link].add_geom(
+                **_at(geom.at),
+                type=getattr(self._library.mjtGeom, f"mjGEOM_{geom.kind.upper()}"),
+                size=geom.size,
+                rgba=geom.color,
+                contype=0,
+                conaffinity=0,
+                **mesh,
+            )
+            elements.shapes.append((shape, link))
 
     def remove(self, number: int) -> None:
         """Remove a body, and the meshes that no other body has."""
@@ -393,9 +375,7 @@ class _Scene:
         """Return the lowest and the highest corners of the boxes around all shapes, (n, 3) each."""
         if self._boxes is None:
             turns = self.data.geom_xmat.reshape(-1, 3, 3)
-            middles = self.data.geom_xpos + np.einsum("nij,nj->ni", turns, self._middles)
-            halves = np.einsum("nij,nj->ni", np.abs(turns), self._halves)
-            self._boxes = middles - halves, middles + halves
+            self._boxes = boxes_around(turns, self.data.geom_xpos, self._middles, self._halves)
         return self._boxes
 
     def cast(
@@ -472,14 +452,13 @@ class _Scene:
 _NONE = np.zeros(0, np.int64)
 
 
+def _at(pose: poses.Pose) -> dict[str, Any]:
+    """Return the place of an element; MuJoCo's quaternions have w first."""
+    x, y, z, w = pose.orientation
+    return {"pos": pose.position, "quat": (w, x, y, z)}
+
+
 # === shapes ===================================================================================================
-
-
-class _Triangles(NamedTuple):
-    """The vertices of a mesh, m, (n, 3), and for each triangle the indices of its vertices, (m, 3)."""
-
-    vertices: NDArray[np.float32]
-    faces: Numbers
 
 
 def _geom(shape: Shape, color: Color) -> _Geom:
@@ -528,7 +507,7 @@ def _color(shape: Shape) -> Color:
 
 
 @lru_cache(maxsize=512)
-def _hull(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangles:
+def _hull(path: str, _status: FileStatus, scale: tuple[float, ...]) -> Mesh:
     """Return the convex hull of a mesh file's points; a flat one is made 1 mm thick. Raises `ValueError`."""
     points = mesh_points(path) * scale
     middle = points.mean(axis=0)
@@ -541,13 +520,13 @@ def _hull(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangle
 
 
 @lru_cache(maxsize=128)
-def _surface(path: str, _status: FileStatus, scale: tuple[float, ...]) -> _Triangles:
+def _surface(path: str, _status: FileStatus, scale: tuple[float, ...]) -> Mesh:
     """Return the triangles of a mesh file as they are. Raises `ValueError`."""
     mesh = read_mesh(path, Path(path).read_bytes())
     return _compiled(path, mesh.vertices * scale, mesh.faces)
 
 
-def _compiled(path: str, vertices: Floats, faces: NDArray[Any]) -> _Triangles:
+def _compiled(path: str, vertices: Floats, faces: NDArray[Any]) -> Mesh:
     """Return the triangles that MuJoCo makes of a mesh; without faces, those of the hull. Raises `ValueError`."""
     mujoco = library()
     spec = mujoco.MjSpec()
@@ -562,7 +541,7 @@ def _compiled(path: str, vertices: Floats, faces: NDArray[Any]) -> _Triangles:
     w, x, y, z = model.mesh_quat[0]
     points = model.mesh_vert.astype(np.float64) @ rotation_matrix((x, y, z, w)).T + model.mesh_pos[0]
     used, corners = np.unique(model.mesh_face, return_inverse=True)
-    return _Triangles(points[used].astype(np.float32), corners.reshape(-1, 3).astype(np.int32))
+    return Mesh(points[used], corners.reshape(-1, 3))
 
 
 def _add_mesh(spec: Any, name: str, vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
@@ -581,19 +560,5 @@ def library() -> Any:
         raise poses.EngineMissing("mujoco")
     mujoco: Any = import_module("mujoco")
     if mujoco.get_mju_user_warning() is None:  # otherwise MuJoCo would write to a file in the current folder
-        mujoco.set_mju_user_warning(_log_warning)
+        mujoco.set_mju_user_warning(partial(_log.warning, "MuJoCo: %s"))
     return mujoco
-
-
-def _log_warning(text: str) -> None:
-    _log.warning("MuJoCo: %s", text)
-
-
-@cache
-def _title() -> str:
-    for package in ("mujoco-core", "mujoco"):
-        try:
-            return f"MuJoCo {version(package)}"
-        except PackageNotFoundError:
-            continue
-    return "MuJoCo"
