@@ -17,7 +17,6 @@ tasks is of the mean over the tasks.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import math
@@ -30,11 +29,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from bench.first_tries import fill, in_kitchen
+from bench.material.runs import options
+from bench.reporting.figures import console
 from pycrorm_async import Memory
 from pycrorm_async.learning import MoveAndPickUp
 from pycrorm_async.learning.experiment import KITCHEN
@@ -115,7 +115,7 @@ async def tasks(url: str, way: str, seed: int, count: int, outcome: Outcome) -> 
     kitchen = in_kitchen()
     async with Memory.open(url) as memory:
         with KITCHEN.entered() as stage, WAYS[way](memory):
-            for number in track(range(count), way, console=_console()):
+            for number in track(range(count), way, console=console()):
                 rng = np.random.default_rng((seed, 1, number))
                 kitchen.prepare(stage, rng, number)
                 goal = stage.target.pose
@@ -136,10 +136,6 @@ async def measure(folder: Path, seeds: int, count: int, remembered: int) -> dict
     return outcomes
 
 
-def _console() -> Console:
-    return Console(stderr=True)
-
-
 def show(figures: dict[str, dict[str, Any]]) -> None:
     table = Table("", "failed per 100 tasks", "first try", "picked up", "placed")
     for name, each in figures.items():
@@ -147,12 +143,11 @@ def show(figures: dict[str, dict[str, Any]]) -> None:
         shares = [f"{count / each['tasks']:.1%} ({least:.0%}-{most:.0%})" for count, least, most in counts]
         low, high = each["failed_interval"]
         table.add_row(name, f"{each['failed_per_100']:.0f} ({low:.0f}-{high:.0f})", *shares)
-    _console().print(table)
+    console().print(table)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed, a few tasks")
+    parser = options(__doc__, quick="one seed, a few tasks")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--tasks", type=int, default=TASKS)
     parser.add_argument("--remembered", type=int, default=REMEMBERED, help="tries remembered before the tasks")

@@ -11,18 +11,15 @@ not grow, the writer keeps up.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
-import tempfile
 import time
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from bench.material.runs import options, place
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
-from tests.databases import server_in
 
 _EVENTS_PER_S = 2_000
 _SAMPLES_PER_S = 2
@@ -68,18 +65,15 @@ async def measure(url: str, spool: Path, seconds: float) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="1 s instead of 20")
+    parser = options(__doc__, quick="1 s instead of 20")
     parser.add_argument("--postgresql", action="store_true", help="use a new PostgreSQL server")
     arguments = parser.parse_args()
     seconds = 1.0 if arguments.quick else 20.0
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        url = f"sqlite:///{folder}/busy.db"
-        if arguments.postgresql:
-            url = stack.enter_context(server_in(folder / "pg")).new_database()
-        result = {"bench": "busy", "database": url.partition(":")[0], "asked_events_per_s": _EVENTS_PER_S}
-        print(json.dumps(result | asyncio.run(measure(url, folder / "spool", seconds))))
+    database = "postgresql" if arguments.postgresql else "sqlite"
+    result = {"bench": "busy", "database": database, "asked_events_per_s": _EVENTS_PER_S}
+    with place(database) as here:
+        result |= asyncio.run(measure(here.new_url("busy"), here.folder / "spool", seconds))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

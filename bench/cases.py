@@ -15,22 +15,18 @@ with medians, minima and maxima, or percentiles; `_cpu` is CPU time without that
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import gc
 import json
-import tempfile
 import time
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 from bench.material.actions import Actions
 from bench.material.rollouts import spool_rollouts
+from bench.material.runs import DATABASES, options, place, store_all
 from bench.reporting.figures import console, cpu_s_of, percentiles, spread, with_children
 from pycrorm_async import Reading
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.projections.projector import Projector
@@ -41,7 +37,7 @@ from pycrorm_async.recall.recall import Recall
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from tests.databases import Server, server_in
+from tests.databases import Server
 
 _SEED = 69
 _LOADS = 5
@@ -130,30 +126,24 @@ async def ask(url: str, actions: Actions, cues: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__, quick="few and small, to check that it works")
     parser.add_argument("--actions", type=int, default=1_000_000, help="actions in the memory that is asked")
     parser.add_argument("--rollouts", type=int, default=5_000, help="rollouts of five actions each that are folded")
-    parser.add_argument("--databases", nargs="+", choices=("sqlite", "postgresql"), default=["sqlite", "postgresql"])
+    parser.add_argument("--databases", nargs="+", choices=DATABASES, default=DATABASES)
     arguments = parser.parse_args()
     count, rollouts, rounds, cues = arguments.actions, arguments.rollouts, 6, 300
     if arguments.quick:
         count, rollouts, rounds, cues = 2_000, 20, 1, 5
     collect_seldom()  # as in `pycrorm writer`
     result: dict[str, Any] = {"bench": "cases", "asked_actions": count, "cues": cues}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        actions = Actions(count, seed=_SEED)
-        for database in arguments.databases:
-            console().print(f"{database} …")
-            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
-            folded, asked = (
-                server.new_database() if server else f"sqlite:///{folder}/{name}.db" for name in ("folded", "asked")
-            )
-            spool_rollouts(rollouts, folder / database, seed=_SEED)
-            report = asyncio.run(recover(folded, spool=folder / database))
-            assert not report.failed, report.failed
-            result[database] = asyncio.run(fold(folded, server, rounds))
+    actions = Actions(count, seed=_SEED)
+    for database in arguments.databases:
+        console().print(f"{database} …")
+        with place(database) as here:
+            folded, asked = here.new_url("folded"), here.new_url("asked")
+            spool_rollouts(rollouts, here.folder / "spool", seed=_SEED)
+            store_all(folded, here.folder / "spool")
+            result[database] = asyncio.run(fold(folded, here.server, rounds))
             asyncio.run(store(asked, actions))
             result[database] |= asyncio.run(ask(asked, actions, cues))
     print(json.dumps(result))

@@ -23,38 +23,26 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import AsyncExitStack, ExitStack
-from dataclasses import dataclass
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import NamedTuple
 
+from bench.material.runs import Place, options, place, record_notes
 from bench.reporting.figures import console
 from pycrorm_async import Memory
-from pycrorm_async.plan import ActionAbstract
-from tests.databases import Server, ask, server_in
+from tests.databases import Server, ask
 
 WARM_UP = 25_000
 """Events of each daemon that are not measured: a batch of 10,000 for each of its two fold workers, and some more."""
 READ = "SELECT idx_tup_fetch + seq_tup_read FROM pg_stat_user_tables WHERE relname = 'event'"
 
 
-@dataclass
-class NoteActionPerformable(ActionAbstract):
-    text: str
-    weight: float
-
-    async def perform(self) -> None: ...
-
-
 async def record(memory: Memory, events: int) -> None:
     """Record episodes of a thousand events each."""
     while memory.status.written < events:
-        async with memory.episode(description="bench"):
-            for index in range(499):
-                await NoteActionPerformable(f"note {index}", index / 7).perform()
+        await record_notes(memory, 499)
 
 
 def start_daemon(url: str, spool: Path) -> subprocess.Popen[str]:
@@ -179,31 +167,28 @@ async def compare(server: Server, folder: Path, numbers: Sequence[int], rounds: 
     }
 
 
-async def measure(stack: ExitStack, options: argparse.Namespace) -> dict[str, object]:
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-    server = stack.enter_context(server_in(folder / "pg")) if options.postgresql or options.daemons else None
-    result: dict[str, object] = {"bench": "daemon", "database": "postgresql" if server else "sqlite"}
-    for recorders in () if options.daemons else (1, 4):
-        url = server.new_database() if server else f"sqlite:///{folder}/{recorders}.db"
-        result[f"from_{recorders}"] = await drain(url, folder / f"{recorders}.spool", recorders, options.events)
-    if server:
-        numbers = options.daemons or [1, 2, 8]
-        result |= await compare(server, folder, numbers, options.rounds, options.events)
-    return result | {"events": options.events}
+async def measure(here: Place, arguments: argparse.Namespace) -> dict[str, object]:
+    result: dict[str, object] = {"bench": "daemon", "database": here.database}
+    for recorders in () if arguments.daemons else (1, 4):
+        spool = here.folder / f"{recorders}.spool"
+        result[f"from_{recorders}"] = await drain(here.new_url(f"{recorders}"), spool, recorders, arguments.events)
+    if here.server:
+        numbers = arguments.daemons or [1, 2, 8]
+        result |= await compare(here.server, here.folder, numbers, arguments.rounds, arguments.events)
+    return result | {"events": arguments.events}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__, quick="2,000 events and one round")
     parser.add_argument("--postgresql", action="store_true", help="on a new server, and several daemons too")
     parser.add_argument("--daemons", type=int, nargs="+", help="only these numbers of daemons, on a new server")
     parser.add_argument("--events", type=int, default=200_000)
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--quick", action="store_true", help="2,000 events and one round")
-    options = parser.parse_args()
-    if options.quick:
-        options.events, options.rounds = 2_000, 1
-    with ExitStack() as stack:
-        print(json.dumps(asyncio.run(measure(stack, options))))
+    arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.events, arguments.rounds = 2_000, 1
+    with place("postgresql" if arguments.postgresql or arguments.daemons else "sqlite") as here:
+        print(json.dumps(asyncio.run(measure(here, arguments))))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ script prints one JSON line; the table is on stderr.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import math
@@ -37,6 +36,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bench.material.runs import options
 from bench.tasks import ERRORS, LEARNING, ROLLOUTS, holds, learned
 from pycrorm_async.learning import Disturbance, MoveAndPickUp, Scene, Stage, load_policy, save_policy
 from pycrorm_async.learning.policy_file import AnyPolicy
@@ -160,8 +160,7 @@ def show(rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few scenes, and models of a few rollouts")
+    parser = options(__doc__, quick="a few scenes, and models of a few rollouts")
     parser.add_argument("--scenes", type=int, default=300, help="of each seed")
     parser.add_argument("--seed", type=int, nargs="+", default=[TRIED], help=f"of the scenes; default {TRIED}")
     parser.add_argument("--only", choices=tuple(CASES))

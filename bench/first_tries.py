@@ -25,7 +25,6 @@ kitchen only.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import math
@@ -38,10 +37,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from bench.material.runs import options
+from bench.reporting.figures import console
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import NotEnoughExperience
 from pycrorm_async.learning import MoveAndPickUp, Policy, RecalledPickUp, Scene, Tally, learn
@@ -255,7 +255,7 @@ async def measure(
         total: dict[str, Tally] = {}
         each_seed: dict[str, list[float]] = {}
         title = f"{case.table}: {case.tries} tries, {case.off_m * 100:g} cm off"
-        for seed in track(range(seeds), title, console=_console()):
+        for seed in track(range(seeds), title, console=console()):
             url = f"sqlite:///{folder}/{case.table.replace(', ', '_')}_{case.tries}_{seed}_{case.off_m}.db"
             for name, tally in (await compared(url, *case[1:4], seed, scenes, case.off_m)).items():
                 total[name] = total.get(name, Tally()) + tally
@@ -265,15 +265,11 @@ async def measure(
             line = {"by": name, "tries": case.tries, "off_m": case.off_m, "first_try": round(tally.success_rate, 3)}
             figures[case.table].append({**line, "interval": interval, "seeds": each_seed[name]})
     for recall in (False, True) if only in (None, "varied") else ():
-        for seed in track(range(seeds), "varied scenes", console=_console()):
+        for seed in track(range(seeds), "varied scenes", console=console()):
             parts, ways = await online(folder, seed, online_scenes, recall=recall)
             by = "recalled" if recall else "default policy"
             figures["varied"].append({"by": by, "seed": seed, "first_try": parts, "ways": ways})
     return figures
-
-
-def _console() -> Console:
-    return Console(stderr=True)
 
 
 def show(figures: dict[str, Any]) -> None:
@@ -286,17 +282,16 @@ def show(figures: dict[str, Any]) -> None:
             table.add_row(
                 str(each["tries"]), off, each["by"], f"{each['first_try']:.1%}", f"{low:.0%}-{high:.0%}", spread
             )
-        _console().print(table)
+        console().print(table)
     curve = Table("chosen by", "seed", f"first try, each {PART} scenes", "ways at the end", title="varied scenes")
     for each in figures["varied"]:
         shares = " ".join(f"{share:.0%}" for share in each["first_try"])
         curve.add_row(each["by"], str(each["seed"]), shares, str(each["ways"]))
-    _console().print(curve)
+    console().print(curve)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed, a few scenes")
+    parser = options(__doc__, quick="one seed, a few scenes")
     parser.add_argument("--only", choices=("heights", "kitchen", "varied"))
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="first_tries_") as folder:

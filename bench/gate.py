@@ -33,8 +33,9 @@ from typing import Any, Final, NamedTuple
 from rich.table import Table
 
 from bench.material.rollouts import spool_rollouts
+from bench.material.runs import read_all
 from bench.material.turns import nothing_action
-from bench.reporting.figures import console
+from bench.reporting.figures import console, table_of
 from pycrorm_async import Memory, Settings
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.core import IS_COMPILED
@@ -44,7 +45,6 @@ from pycrorm_async.plan.execution import recorder
 from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.projections.custom import own_projections
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld
@@ -54,12 +54,12 @@ ON_RECORD: Final = Path(__file__).with_name("gate.json")
 RAW: Final = {"hooks": "JSON lines", "append": "executemany", "fold": "executemany", "hook to row": "all rows"}
 TURNS, ACTIONS, ROLLOUTS = 25, 200, 200
 _INSERT = "INSERT INTO event VALUES (?, ?, ?, ?, ?, ?, ?)"
-_STARTED: Final[dict[str, Any]] = {
+STARTED: Final[dict[str, Any]] = {
     "event": "start", "node": 17, "parent": 2, "type": "PickUpAction", "wall_ns": 1_795_416_560_556_237_149,
     "parameters": {"object_designator": "milk", "arm": "LEFT", "grasp": "FRONT"},
     "robot": {"position": [1.25, -0.5, 0.0], "orientation": [0.0, 0.0, 0.7071, 0.7071], "frame": "map", "torso": 0.3},
 }  # fmt: skip
-_ENDED: Final = {"event": "end", "node": 17, "status": "SUCCEEDED", "wall_ns": 1_795_416_560_556_237_149}
+ENDED: Final[dict[str, Any]] = {"event": "end", "node": 17, "status": "SUCCEEDED", "wall_ns": 1_795_416_560_556_237_149}
 
 
 class Part(NamedTuple):
@@ -111,7 +111,7 @@ async def _hooks(stack: AsyncExitStack, folder: Path) -> dict[str, Part]:
 
     async def lines() -> None:
         for _ in range(ACTIONS):
-            for event in (_STARTED, _ENDED):
+            for event in (STARTED, ENDED):
                 file.write(json.dumps(event) + "\n")
                 file.flush()
 
@@ -133,11 +133,7 @@ async def _storage(stack: AsyncExitStack, folder: Path) -> dict[str, Part]:
         "CREATE TABLE event (episode TEXT, sequence INTEGER, type TEXT, version INTEGER, wall_ns INTEGER,"
         " monotonic_ns INTEGER, payload TEXT, PRIMARY KEY (episode, sequence)) STRICT"
     )
-    [recorded] = Spool(spool).recorders()
-    source = open_dead(recorded.path)
-    assert source is not None
-    records = await source.get_batch(events_max=10_000, bytes_max=2**22, age_s_max=0.0)
-    source.release()
+    records = await read_all(spool)
     assert await log.append([each for each in records if each.episode is None]) == {}
     events = [each for each in records if each.episode is not None]
     batch: list[Record] = []
@@ -246,9 +242,8 @@ def _outcome(ratio: float, known: float | None) -> str:
 def _table(
     least_us: dict[str, float], found: dict[str, float], known: dict[str, float], outcomes: dict[str, str]
 ) -> Table:
-    table = Table(title=f"CPU time against raw writing, {core()} core", title_justify="left")
-    for name in ("part", "µs", "raw way", "µs", "ratio", "on record", ""):
-        table.add_column(name, justify="left" if name in ("part", "raw way", "") else "right")
+    header = "part: | µs | raw way: | µs | ratio | on record | :"
+    table = table_of(f"CPU time against raw writing, {core()} core", header)
     for name, raw in RAW.items():
         cells = (
             f"{least_us[name]:.2f}",

@@ -20,11 +20,8 @@ import json
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,10 +29,9 @@ from rich.table import Table
 
 from bench.daemon import start_daemon, stop
 from bench.material.rollouts import progress, spool_rollouts, until_folded
-from bench.reporting.figures import console, held_mb, spread
+from bench.material.runs import Place, options, place, record_notes
+from bench.reporting.figures import console, held_mb, spread, table_of
 from pycrorm_async import Memory
-from pycrorm_async.plan import ActionAbstract
-from tests.databases import Server, server_in
 
 _NODES_A_ROLLOUT = 9.76
 _SEED = 69
@@ -67,17 +63,14 @@ QUICK = Sizes(nodes=500, an_episode=(10,), recorders=(2,), daemons=(2,), episode
 class Databases:
     """Create databases of one kind, and folders for their spools."""
 
-    def __init__(self, folder: Path, server: Server | None) -> None:
-        self._folder = folder
-        self._server = server
+    def __init__(self, here: Place) -> None:
+        self._place = here
         self._count = 0
 
     def new(self) -> tuple[str, Path]:
         """Return the URL of an empty database, and the path of its spool."""
         self._count += 1
-        spool = self._folder / f"{self._count}.spool"
-        url = self._server.new_database() if self._server else f"sqlite:///{self._folder}/{self._count}.db"
-        return url, spool
+        return self._place.new_url(f"{self._count}"), self._place.folder / f"{self._count}.spool"
 
 
 # --- measurements ---------------------------------------------------------------------------------------------------
@@ -138,14 +131,6 @@ def add_episodes(databases: Databases, sizes: Sizes) -> dict[str, dict[str, floa
     return rates_by_episodes
 
 
-@dataclass
-class NoteActionPerformable(ActionAbstract):
-    text: str
-    weight: float
-
-    async def perform(self) -> None: ...
-
-
 async def record_and_measure(url: str, spool: Path, counts: tuple[int, ...]) -> dict[str, dict[str, float]]:
     """Record nodes, and return the resident MB of this process by count: all pages, and those without a file."""
     memory_mb: dict[str, dict[str, float]] = {}
@@ -153,10 +138,8 @@ async def record_and_measure(url: str, spool: Path, counts: tuple[int, ...]) -> 
     async with Memory.open(url, spool=spool) as memory:
         for count in counts:
             while recorded < count:
-                async with memory.episode(description="bench"):
-                    for index in range(min(1_000, count - recorded)):
-                        await NoteActionPerformable(f"note {index}", index / 7).perform()
-                        recorded += 1
+                await record_notes(memory, more := min(1_000, count - recorded))
+                recorded += more
                 await memory.flush()
             memory_mb[str(count)] = {"mb": held_mb("VmRSS"), "mb_without_files": held_mb("RssAnon")}
     return memory_mb
@@ -215,8 +198,7 @@ def measure(databases: Databases, sizes: Sizes, turns: int, *, postgresql: bool)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few hundred nodes, one turn")
+    parser = options(__doc__, quick="a few hundred nodes, one turn")
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     parser.add_argument("--record", nargs=2, help=argparse.SUPPRESS)
@@ -228,20 +210,17 @@ def main() -> None:
         return
     sizes, turns = (QUICK, 1) if arguments.quick else (LONG, arguments.turns)
     result: dict[str, Any] = {"bench": "growth", "sizes": sizes._asdict(), "turns": turns, "seed": _SEED}
-    with ExitStack() as stack:
-        for database in arguments.databases:
-            console().print(database)
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
-            result[database] = measure(Databases(folder, server), sizes, turns, postgresql=server is not None)
+    for database in arguments.databases:
+        console().print(database)
+        with place(database) as here:
+            result[database] = measure(Databases(here), sizes, turns, postgresql=here.server is not None)
     print(json.dumps(result))
     console().print(_table(result, arguments.databases))
 
 
 def _table(result: dict[str, Any], databases: list[str]) -> Table:
-    table = Table(title="Nodes a second from the spool to every row", title_justify="left")
-    for name in ("database", "parameter", "value", "nodes/s", "least", "most", ""):
-        table.add_column(name, justify="left" if name in ("database", "parameter", "") else "right")
+    header = "database: | parameter: | value | nodes/s | least | most | :"
+    table = table_of("Nodes a second from the spool to every row", header)
     for database in databases:
         for parameter, points in result[database].items():
             for value, rate in points.items():

@@ -13,21 +13,19 @@ JSON line: by database, Python, size and command, events a second of CPU time an
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from subprocess import DEVNULL, Popen
 from typing import Any
 
 from bench.material.rollouts import spool_rollouts
+from bench.material.runs import options, place
 from bench.reporting.figures import console
-from tests.databases import ask_to_change, server_in
+from tests.databases import ask_to_change
 
 _EVENTS_A_ROLLOUT = 20.04
 _SEED = 69
@@ -70,8 +68,7 @@ def measure(url: str, folder: Path, pythons: Sequence[str], events: int, turns: 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="2,000 events, one turn, SQLite")
+    parser = options(__doc__, quick="2,000 events, one turn, SQLite")
     parser.add_argument("--events", type=int, nargs="+", default=[100_000, 320_000])
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
@@ -81,14 +78,12 @@ def main() -> None:
     if arguments.quick:
         sizes, turns, databases = [2_000], 1, ["sqlite"]
     result: dict[str, Any] = {"bench": "lake", "turns": turns, "seed": _SEED}
-    with ExitStack() as stack:
-        for database in databases:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
+    for database in databases:
+        with place(database) as here:
             for events in sizes:
                 console().print(f"{database}, {events:,} events")
-                url = server.new_database() if server else f"sqlite:///{folder}/{events}.db"
-                figures = measure(url, folder, [sys.executable, *arguments.python], events, turns)
+                pythons = [sys.executable, *arguments.python]
+                figures = measure(here.new_url(f"{events}"), here.folder, pythons, events, turns)
                 result.setdefault(database, {})[f"{events:,}"] = figures
     print(json.dumps(result))
 

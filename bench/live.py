@@ -35,6 +35,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from PIL import Image
 
+from bench.material.runs import options
 from bench.reporting.figures import console, cpu_s_of, percentiles
 from pycrorm_async import Memory
 from pycrorm_async.record.camera import CameraStream
@@ -197,8 +198,7 @@ def measure(rate: int, seconds: float, folder: Path, *, draws: bool, cameras: Se
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one rate, two seconds")
+    parser = options(__doc__, quick="one rate, two seconds")
     parser.add_argument("--seconds", type=float, default=15.0, help="duration of each rate")
     parser.add_argument("--read", help=argparse.SUPPRESS)
     arguments = parser.parse_args()

@@ -13,16 +13,12 @@ row (median, minimum, maximum; without the CPU time of a server), and their rati
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import gc
 import json
-import tempfile
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import ExitStack
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -31,11 +27,10 @@ from sqlalchemy.orm import Session
 
 from bench.material.baseline import LEAVES, ActionRow, TaskTreeNodeRow, engine_of, store
 from bench.material.rollouts import spool_tree, tree
-from bench.reporting.figures import MISSING, console, spread
+from bench.material.runs import Place, options, place, store_all
+from bench.reporting.figures import MISSING, console, spread, table_of
 from pycrorm_async import Reading
-from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
-from tests.databases import Server, server_in
 
 _ROWS = 25_000
 _READ_ROWS = 500
@@ -51,21 +46,20 @@ Side = Callable[[], Awaitable[int]]
 def sides(engine: Engine, reading: Reading, rows: int) -> dict[str, tuple[Side, Side]]:
     """Return by name the same query of the system of the thesis and of this package."""
 
+    def loaded(rows: Any, *, read: bool) -> int:
+        return len([each.robot_state.pose.position.x for each in rows] if read else rows)
+
     def thesis(class_: Any, limit: int, *, read: bool = False) -> Side:
         async def load() -> int:
             with Session(engine) as session:
-                objects = session.scalars(select(class_).limit(limit)).all()
-                places = [each.robot_state.pose.position.x for each in objects] if read else objects
-                return len(places)
+                return loaded(session.scalars(select(class_).limit(limit)).all(), read=read)
 
         return load
 
     def ours(class_: Any, limit: int, *, read: bool = False) -> Side:
         async def load() -> int:
             async with reading.session() as session:
-                objects = (await session.scalars(select(class_).limit(limit))).all()
-                places = [each.robot_state.pose.position.x for each in objects] if read else objects
-                return len(places)
+                return loaded((await session.scalars(select(class_).limit(limit))).all(), read=read)
 
         return load
 
@@ -106,37 +100,31 @@ async def measure(engine: Engine, url: str, rows: int, rounds: int) -> dict[str,
     return result
 
 
-def fill(folder: Path, server: Server | None, rows: int) -> tuple[Engine, str]:
+def fill(here: Place, rows: int) -> tuple[Engine, str]:
     """Store one tree with both sides; return the baseline's engine and the URL of our memory."""
-    name = "postgresql" if server else "sqlite"
     task_tree = tree(max(50, round(rows * _NODES_A_ROW)), _SEED)
-    engine = engine_of(server.new_database() if server else f"sqlite:///{folder}/baseline.db")
+    engine = engine_of(here.new_url("baseline"))
     store(task_tree, engine)
-    url = server.new_database() if server else f"sqlite:///{folder}/ours.db"
-    spool = folder / f"spool_{name}"
-    spool_tree(task_tree, spool)
-    report = asyncio.run(recover(url, spool=spool))
-    assert not report.failed, report.failed
+    url = here.new_url("ours")
+    spool_tree(task_tree, here.folder / "spool")
+    store_all(url, here.folder / "spool")
     return engine, url
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="100 rows, one round")
+    parser = options(__doc__, quick="100 rows, one round")
     parser.add_argument("--rows", type=int, default=_ROWS)
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     arguments = parser.parse_args()
     rows, rounds = (100, 1) if arguments.quick else (arguments.rows, _ROUNDS)
     result: dict[str, Any] = {"bench": "objects", "rounds": rounds, "seed": _SEED}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        for database in arguments.databases:
-            if database == "postgresql" and find_spec("psycopg") is None:
-                result[database] = MISSING
-                continue
-            console().print(f"{database}, {rows:,} rows …")
-            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
-            engine, url = fill(folder, server, rows)
+    for database in arguments.databases:
+        if database == "postgresql" and find_spec("psycopg") is None:
+            result[database] = MISSING
+            continue
+        console().print(f"{database}, {rows:,} rows …")
+        with place(database) as here:
+            engine, url = fill(here, rows)
             result[database] = asyncio.run(measure(engine, url, rows, rounds))
             engine.dispose()
     print(json.dumps(result))
@@ -144,9 +132,7 @@ def main() -> None:
 
 
 def _table(result: dict[str, Any], databases: list[str]) -> Table:
-    table = Table(title="Rows as mapped objects", title_justify="left")
-    for name in ("database", "query", "rows", "thesis, ms", "ours, ms", "CPU: ours is"):
-        table.add_column(name, justify="left" if name in ("database", "query") else "right")
+    table = table_of("Rows as mapped objects", "database: | query: | rows | thesis, ms | ours, ms | CPU: ours is")
     for database in databases:
         if result[database] == MISSING:
             table.add_row(database, MISSING)

@@ -15,7 +15,6 @@ time at the largest size to that at the smallest.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import gc
 import json
@@ -31,6 +30,7 @@ from typing import Any, Self
 
 from sqlalchemy import Engine, event
 
+from bench.material.runs import options
 from bench.reporting.figures import console
 from pycrorm_async import Reading
 from pycrorm_async.events.codec import Record
@@ -261,14 +261,13 @@ async def measure(url_of: dict[int, str], rounds: int) -> dict[str, dict[str, An
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__, quick="200 episodes and one round, to check that it works")
     parser.add_argument("--episodes", type=int, default=5_000, help="of the large memory")
     parser.add_argument("--than", type=int, default=50, help="episodes of the small memory")
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--quick", action="store_true", help="200 episodes and one round, to check that it works")
-    options = parser.parse_args()
-    sizes = (options.than, 200 if options.quick else options.episodes)
+    arguments = parser.parse_args()
+    sizes = (arguments.than, 200 if arguments.quick else arguments.episodes)
     line: dict[str, Any] = {"bench": "one_episode", "episodes": list(sizes)}
     gc.disable()
     with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder) / "server", syncs=False) as server:
@@ -276,14 +275,14 @@ def main() -> None:
             "sqlite": {size: f"sqlite:///{folder}/{size}.db" for size in sizes},
             "postgresql": {size: server.new_database() for size in sizes},
         }
-        for database in options.databases:
+        for database in arguments.databases:
             url_of = urls[database]
             for size, url in url_of.items():
                 asyncio.run(fill(url, size))
                 if database == "postgresql":
                     ask_to_change(url, "ANALYZE")
                 console().print(f"{database}: {size} episodes are stored")
-            line[database] = asyncio.run(measure(url_of, 1 if options.quick else options.rounds))
+            line[database] = asyncio.run(measure(url_of, 1 if arguments.quick else arguments.rounds))
             for name, each in line[database].items():
                 console().print(f"{name:24} {each}")
     print(json.dumps(line))

@@ -14,7 +14,6 @@ prints one JSON line: events a second (median, minimum, maximum), and our rate d
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import importlib
 import itertools
@@ -26,8 +25,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
-from functools import partial
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +37,8 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.ext.asyncio import create_async_engine
 
 from bench.material.rollouts import spool_tree, tree
-from bench.reporting.figures import MISSING, console, spread
+from bench.material.runs import options, place, read_all
+from bench.reporting.figures import MISSING, console, spread, table_of
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.codec import Record
@@ -49,7 +48,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
-from tests.databases import Server, server_in
 
 # === contenders ===============================================================================================
 #
@@ -297,18 +295,7 @@ def material_of(events: int, folder: Path) -> Material:
     spool_tree(tree(events // 2, seed=69), spool)
     copy = folder / "read"
     shutil.copytree(spool, copy)
-    return Material([each for each in asyncio.run(_read(copy)) if each.episode is not None], spool, folder)
-
-
-async def _read(spool: Path) -> list[Record]:
-    [folder] = Spool(spool).recorders()
-    queue = open_dead(folder.path)
-    assert queue is not None
-    records: list[Record] = []
-    while batch := await queue.get_batch(events_max=10_000, bytes_max=2**22, age_s_max=0.0):
-        records += batch
-    queue.release()
-    return records
+    return Material([each for each in asyncio.run(read_all(copy)) if each.episode is not None], spool, folder)
 
 
 def _version(package: str) -> str | None:
@@ -318,8 +305,7 @@ def _version(package: str) -> str | None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="1,000 events, one turn")
+    parser = options(__doc__, quick="1,000 events, one turn")
     parser.add_argument("--events", type=int, default=100_000)
     parser.add_argument("--turns", type=int, default=3)
     arguments = parser.parse_args()
@@ -334,12 +320,9 @@ def main() -> None:
     }
     for target, contenders in CONTENDERS.items():
         console().print(target)
-        with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-            server = stack.enter_context(server_in(folder / "pg")) if target == "postgresql" else None
-            material = material_of(events, folder)
-            numbers = itertools.count()
-            rates = measure(contenders, material, turns, partial(_new_url, folder, server, numbers))
+        with place(target) as here:
+            material, numbers = material_of(events, here.folder), itertools.count()
+            rates = measure(contenders, material, turns, lambda: here.new_url(f"{next(numbers)}"))  # noqa: B023
             result[target] = {"events": len(material.records), **rates}
     print(json.dumps(result))
     console().print(_table(result))
@@ -349,14 +332,8 @@ def _raise_timeout(*_: object) -> None:
     raise TimeoutError
 
 
-def _new_url(folder: Path, server: Server | None, numbers: Iterator[int]) -> str:
-    return server.new_database() if server else f"sqlite:///{folder}/{next(numbers)}.db"
-
-
 def _table(result: dict[str, Any]) -> Table:
-    table = Table(title="Events stored by each contender", title_justify="left")
-    for name in ("into", "contender", "events/s", "least", "most", "ours / theirs"):
-        table.add_column(name, justify="left" if name in ("into", "contender") else "right")
+    table = table_of("Events stored by each contender", "into: | contender: | events/s | least | most | ours / theirs")
     for target, contenders in CONTENDERS.items():
         for name in contenders:
             figures = result[target][name]

@@ -10,7 +10,6 @@ The script prints one JSON line: µs an event, and the ratio to plain tables.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
@@ -21,10 +20,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from bench.material.rollouts import spool_rollouts
-from pycrorm_async.events.codec import Record
+from bench.material.runs import options, read_all
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.placement import Placement
@@ -53,19 +51,10 @@ async def _open(server: Server, partitions: int) -> _Memory:
     return _Memory(log, projector, [])
 
 
-async def _events(folder: Path, rollouts: int) -> list[Record]:
-    await asyncio.to_thread(spool_rollouts, rollouts, folder, seed=69, an_episode=rollouts)
-    [recorded] = Spool(folder).recorders()
-    source = open_dead(recorded.path)
-    assert source is not None
-    records = await source.get_batch(events_max=1_000_000, bytes_max=2**28, age_s_max=0.0)
-    source.release()
-    return list(records)
-
-
 async def measure(server: Server, folder: Path, rollouts: int, turns: int) -> dict[str, dict[str, float]]:
     """Return the least CPU time of each placement, in µs an event."""
-    records = await _events(folder / "spool", rollouts)
+    await asyncio.to_thread(spool_rollouts, rollouts, folder / "spool", seed=69, an_episode=rollouts)
+    records = await read_all(folder / "spool")
     memories = {each: await _open(server, each) for each in PLACEMENTS}
     least: dict[str, dict[int, float]] = {part: dict.fromkeys(PLACEMENTS, float("inf")) for part in ("append", "fold")}
     for turn in range(turns + 1):
@@ -94,8 +83,7 @@ async def measure(server: Server, folder: Path, rollouts: int, turns: int) -> di
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few events and two turns")
+    parser = options(__doc__, quick="few events and two turns")
     quick = parser.parse_args().quick
     with server_in_memory() as server, tempfile.TemporaryDirectory(prefix="b") as folder:
         costs = asyncio.run(measure(server, Path(folder), 50 if quick else 500, 2 if quick else 12))

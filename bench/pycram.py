@@ -24,7 +24,6 @@ memory of PyCRAM that they drive out of the caches, and the turns of the memory'
 
 from __future__ import annotations
 
-import argparse
 import gc
 import json
 import os
@@ -37,6 +36,8 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import wraps
 from pathlib import Path
 from typing import Any
+
+from bench.material.runs import options
 
 _PAIRS = 25
 _TIMED_BLOCKS = 10
@@ -197,8 +198,7 @@ def perform() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__, quick="few and small, to check that it works")
     parser.add_argument("--pairs", type=int, default=_PAIRS)
     parser.add_argument("--writer", choices=("daemon", "daemon-50ms", "thread", "idle"))
     given = parser.parse_args()

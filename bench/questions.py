@@ -13,14 +13,11 @@ The script prints one JSON line: ms (median, minimum, maximum) and the number of
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import gc
 import json
-import tempfile
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +25,14 @@ from rich.table import Table
 from sqlalchemy import func, select
 
 from bench.material.rollouts import spool_rollouts
-from bench.reporting.figures import console, spread
+from bench.material.runs import options, place, store_all
+from bench.reporting.figures import console, spread, table_of
 from pycrorm_async import Memory, Reading, UserView
-from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Object, PickUpAction, PickUpWithContextView, Pose, ProcessMetaData, TaskTreeNode
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import ObjectType
-from tests.databases import ask, server_in
+from tests.databases import ask
 
 _ROUNDS = 7
 _ANALYSED_S_MAX = 600
@@ -116,9 +113,7 @@ async def fill(url: str, spool: Path, pick_ups: int) -> dict[str, float]:
     begin_s = time.perf_counter()
     events = await asyncio.to_thread(spool_rollouts, pick_ups, spool, seed=_SEED)
     spooled_s = time.perf_counter()
-    report = await recover(url, spool=spool)
-    assert not report.failed, report.failed
-    assert not report.drained.stopped, report.drained.stopped
+    await asyncio.to_thread(store_all, url, spool)
     folded_s = time.perf_counter()
     async with Memory.open(url, spool=spool, views=[KEPT]) as memory:
         await memory.flush()
@@ -157,24 +152,21 @@ async def measure(url: str, pick_ups: int, rounds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="100 pick-ups, one round")
+    parser = options(__doc__, quick="100 pick-ups, one round")
     parser.add_argument("--pick-ups", type=int, nargs="+", default=[1_000, 50_000])
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     arguments = parser.parse_args()
     sizes, rounds = ([100], 1) if arguments.quick else (arguments.pick_ups, _ROUNDS)
     result: dict[str, Any] = {"bench": "questions", "rounds": rounds, "seed": _SEED}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        for database in arguments.databases:
-            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
-            result[database] = {}
+    for database in arguments.databases:
+        result[database] = {}
+        with place(database) as here:
             for size in sizes:
                 console().print(f"{database}, {size:,} pick-ups …")
-                url = server.new_database() if server else f"sqlite:///{folder}/{size}.db"
-                filled = asyncio.run(fill(url, folder / f"{database}{size}", size))
+                url = here.new_url(f"{size}")
+                filled = asyncio.run(fill(url, here.folder / f"spool{size}", size))
                 console().print(f"  filled: {filled}")
-                if server and not arguments.quick:
+                if here.server and not arguments.quick:
                     wait_for_autovacuum(url)
                 result[database][str(size)] = {"filled_s": filled, **asyncio.run(measure(url, size, rounds))}
     print(json.dumps(result))
@@ -182,9 +174,7 @@ def main() -> None:
 
 
 def _table(result: dict[str, Any], databases: list[str]) -> Table:
-    table = Table(title="Queries, ms", title_justify="left")
-    for name in ("database", "pick-ups", "query", "rows", "median", "least", "most"):
-        table.add_column(name, justify="left" if name in ("database", "query") else "right")
+    table = table_of("Queries, ms", "database: | pick-ups | query: | rows | median | least | most")
     for database in databases:
         for size, queries in result[database].items():
             for name, each in queries.items():

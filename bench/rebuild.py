@@ -32,6 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.material.concurrent_processes import ConcurrentProcesses
+from bench.material.runs import options
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
@@ -134,9 +135,8 @@ def table(database: str, by_workers: dict[str, list[Figures]]) -> Table:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__, quick="2,000 and 10,000 events")
     parser.add_argument("--postgresql", action="store_true", help="use a new PostgreSQL server")
-    parser.add_argument("--quick", action="store_true", help="2,000 and 10,000 events")
     parser.add_argument("--events", type=int, nargs="+", metavar="N", help="sizes of the logs")
     parser.add_argument("--workers", type=int, nargs="+", default=[1], metavar="N", help="numbers of folding processes")
     parser.add_argument("--in", dest="folder", type=Path, metavar="FOLDER", help="folder in which SQLite logs are kept")

@@ -16,7 +16,6 @@ not installed.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import importlib
 import json
@@ -30,6 +29,7 @@ from types import ModuleType
 from typing import Any
 
 from bench.material.actions import BLOCK_CASES, CUES, Actions
+from bench.material.runs import options
 from bench.reporting.figures import MISSING, console, percentiles, spread
 from pycrorm_async.recall.answer import Sequences, answer
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, decode, encode, merge
@@ -133,8 +133,7 @@ _FLUSHED = 64
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
+    parser = options(__doc__, quick="few and small, to check that it works")
     parser.add_argument("--actions", type=int, nargs="+")
     parser.add_argument("--no-soar", action="store_true")
     parser.add_argument("--cues", type=int, help="of each kind; 200 by default")

@@ -38,9 +38,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from bench.gate import core
+from bench.gate import ENDED, STARTED, core
 from bench.material.baseline import engine_of, store
 from bench.material.rollouts import Tree, tree_of
+from bench.material.runs import options
 from bench.material.turns import nothing_action
 from bench.reporting.figures import MISSING, console
 from pycrorm_async import Memory, Settings
@@ -50,12 +51,6 @@ from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.world import BulletWorld, Pose
 from tests.databases import ask
 
-STARTED: Final[dict[str, Any]] = {
-    "event": "start", "node": 17, "parent": 2, "type": "PickUpAction", "wall_ns": 1_795_416_560_556_237_149,
-    "parameters": {"object_designator": "milk", "arm": "LEFT", "grasp": "FRONT"},
-    "robot": {"position": [1.25, -0.5, 0.0], "orientation": [0.0, 0.0, 0.7071, 0.7071], "frame": "map", "torso": 0.3},
-}  # fmt: skip
-ENDED: Final[dict[str, Any]] = {"event": "end", "node": 17, "status": "SUCCEEDED", "wall_ns": STARTED["wall_ns"]}
 _SETTINGS: Final = Settings(spool_bytes_max=2**33, segment_bytes=2**26)
 _PAUSE_S: Final = 0.001
 _EVENTS_BEFORE_KILL: Final = 200
@@ -387,8 +382,7 @@ def _is_installed(name: str, rival: Rival) -> bool:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="2 turns of 20 actions, one kill each")
+    parser = options(__doc__, quick="2 turns of 20 actions, one kill each")
     parser.add_argument("--turns", type=int, default=20)
     parser.add_argument("--kills", type=int, default=3)
     parser.add_argument("--record", help=argparse.SUPPRESS)

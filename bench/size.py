@@ -14,23 +14,19 @@ one byte a node, and the bytes of the payloads by type of event.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
-import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable
-from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from bench.material.rollouts import Tree, spool_tree, tree
+from bench.material.runs import DATABASES, Place, options, place
 from bench.reporting.figures import MISSING
 from bench.thesis import run_baseline, store_by_us
-from tests.databases import ask, server_in
+from tests.databases import ask
 
 _SEED = 69
 _PAGES = "SELECT name, sum(pgsize) FROM dbstat GROUP BY name"
@@ -82,16 +78,13 @@ def _without(empty: dict[str, int], stored: dict[str, int]) -> dict[str, int]:
     return {name: size - empty.get(name, 0) for name, size in stored.items()}
 
 
-def measure(
-    new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, with_baseline: bool, rollouts: int = 0
-) -> dict[str, Any]:
+def measure(here: Place, task_tree: Tree, rollouts: int) -> dict[str, Any]:
     """Store the tree with both sides, and learn from rollouts if there are any; return the bytes a node."""
     sizes_by_name: list[dict[str, int]] = []
     for name, each in (("empty", Tree([], 1)), ("ours", task_tree)):
-        spool = folder / name
-        recorded = folder / f"{name}.recorded"
+        spool, recorded = here.folder / name, here.folder / f"{name}.recorded"
         events = spool_tree(each, recorded)
-        url = new_url(name)
+        url = here.new_url(name)
         store_by_us(url, recorded, spool, events)
         sizes_by_name.append(sizes(url))
     empty, stored = sizes_by_name
@@ -101,38 +94,25 @@ def measure(
         "learned": MISSING,
     }
     if rollouts:
-        result["learned"] = learned(new_url("learned"), folder, rollouts, empty)
-    if with_baseline:
-        url = new_url("thesis")
+        result["learned"] = learned(here.new_url("learned"), here.folder, rollouts, empty)
+    if here.server is None or find_spec("psycopg") is not None:
+        url = here.new_url("thesis")
         run_baseline(url, task_tree.nodes, _SEED)
         result["thesis_bytes_a_node"] = round(sum(sizes(url).values()) / task_tree.nodes)
     return result
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="300 nodes, 100 rollouts")
+    parser = options(__doc__, quick="300 nodes, 100 rollouts")
     parser.add_argument("--nodes", type=int, default=30_000)
     parser.add_argument("--rollouts", type=int, default=2_000, help="that `pycrorm learn` learns from; 0: leave it out")
     arguments = parser.parse_args()
     rollouts = (100 if arguments.quick else arguments.rollouts) if find_spec("jpt") is not None else 0
     task_tree = tree(300 if arguments.quick else arguments.nodes, _SEED)
     result: dict[str, Any] = {"bench": "size", "nodes": task_tree.nodes}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        files = folder / "sqlite"
-        files.mkdir()
-        result["sqlite"] = measure(
-            lambda name: f"sqlite:///{files}/{name}.db", task_tree, files, with_baseline=True, rollouts=rollouts
-        )
-        shutil.rmtree(files)
-        server = stack.enter_context(server_in(folder / "pg"))
-        servers = folder / "postgresql"
-        servers.mkdir()
-        has_driver = find_spec("psycopg") is not None
-        result["postgresql"] = measure(
-            lambda _name: server.new_database(), task_tree, servers, with_baseline=has_driver, rollouts=rollouts
-        )
+    for database in DATABASES:
+        with place(database) as here:
+            result[database] = measure(here, task_tree, rollouts)
     print(json.dumps(result))
 
 

@@ -9,13 +9,14 @@ memory of it in MB, and the ratios to the imports that no program on these libra
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
 import tempfile
 from pathlib import Path
 from typing import Final
+
+from bench.material.runs import options
 
 PROCESSES: Final = {
     "empty": ["-c", ""],
@@ -65,8 +66,7 @@ def measure(rounds: int) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="2 processes of each kind")
+    parser = options(__doc__, quick="2 processes of each kind")
     rounds = 2 if parser.parse_args().quick else 10
     print(json.dumps({"bench": "start", "rounds": rounds, **measure(rounds)}))
 

@@ -18,7 +18,6 @@ The script prints one JSON line; the table is on stderr.
 
 from __future__ import annotations
 
-import argparse
 import json
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -26,10 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from bench.material.runs import options
+from bench.reporting.figures import console
 from pycrorm_async.learning import Draws, PickUpChoice, PickUpContext, PolarPolicy, SuccessModel, default_policy
 from pycrorm_async.learning.tree import learn_polar
 from pycrorm_async.query.success import interval_95
@@ -153,7 +153,7 @@ def measure(cases: tuple[Case, ...], seeds: int, tries: int, held_out: int) -> l
             running = processes.map(
                 measured, *zip(*((case, seed, tries, held_out) for seed in range(seeds)), strict=True)
             )
-            each = list(track(running, title, total=seeds, console=_console()))
+            each = list(track(running, title, total=seeds, console=console()))
         successes, total = sum(one.successes for one in each), sum(one.rollouts for one in each)
         rows.append(
             {
@@ -167,12 +167,8 @@ def measure(cases: tuple[Case, ...], seeds: int, tries: int, held_out: int) -> l
                 "best": [round(one.best, 4) for one in each],
             }
         )
-        _console().print(rows[-1])
+        console().print(rows[-1])
     return rows
-
-
-def _console() -> Console:
-    return Console(stderr=True)
 
 
 def show(rows: list[dict[str, Any]]) -> None:
@@ -181,12 +177,11 @@ def show(rows: list[dict[str, Any]]) -> None:
         low, high = row["interval"]
         spread = [" ".join(f"{share:.1%}" for share in row[name]) for name in ("seeds", "worst", "coverage", "best")]
         table.add_row(row["learned"], f"{row['rollouts']:,}", f"{row['rate']:.1%}", f"{low:.1%}-{high:.1%}", *spread)
-    _console().print(table)
+    console().print(table)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed, fewer rollouts")
+    parser = options(__doc__, quick="one seed, fewer rollouts")
     quick = parser.parse_args().quick
     cases = tuple(each._replace(rollouts=each.rollouts // 3) for each in CASES[2:]) if quick else CASES
     rows = measure(cases, 1 if quick else 3, 200 if quick else 1_000, 500 if quick else 2_000)

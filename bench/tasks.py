@@ -58,6 +58,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from bench.material.runs import options
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import NotEnoughExperience
 from pycrorm_async.learning import Disturbance, MoveAndPickUp, Scene, load_policy, save_policy
@@ -495,8 +496,7 @@ def compared(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few tasks, and a model of a few rollouts")
+    parser = options(__doc__, quick="a few tasks, and a model of a few rollouts")
     parser.add_argument("--tasks", type=int, default=60)
     parser.add_argument("--seed", type=int, default=69)
     parser.add_argument("--workers", type=int, default=2)

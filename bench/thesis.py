@@ -23,8 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -34,8 +32,19 @@ from rich.table import Table
 from bench.daemon import start_daemon, stop
 from bench.material.baseline import BaselineBase, Statements, engine_of, store
 from bench.material.rollouts import Tree, spool_tree, tree, until_folded
-from bench.reporting.figures import MISSING, console, cpu_s_of, held_mb, memory_free_gb, peak_mb, spread, with_children
-from tests.databases import Server, ask, server_in
+from bench.material.runs import Place, options, place
+from bench.reporting.figures import (
+    MISSING,
+    console,
+    cpu_s_of,
+    held_mb,
+    memory_free_gb,
+    peak_mb,
+    spread,
+    table_of,
+    with_children,
+)
+from tests.databases import ask
 
 _BYTES_A_NODE = 36_000
 """Memory of the baseline for a node, because it keeps all rows as objects until it commits."""
@@ -111,18 +120,17 @@ def run_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
     return dict(json.loads(completed.stdout))
 
 
-def compare(task_tree: Tree, folder: Path, *, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
+def compare(task_tree: Tree, folder: Path, here: Place, *, seed: int, repeat: int) -> dict[str, Any]:
     """Measure both sides with one tree."""
     spooled = folder / "spooled"
     events = spool_tree(task_tree, spooled)
-    new_url = partial(_new_url, folder, server)
     baseline, ours = [], []
     nodes = task_tree.nodes
     for turn in range(repeat):
-        baseline.append(run_baseline(new_url(f"baseline{turn}"), nodes, seed))
+        baseline.append(run_baseline(here.new_url(f"{folder.name}/baseline{turn}"), nodes, seed))
         spool = folder / f"spool{turn}"
         shutil.copytree(spooled, spool)
-        ours.append(store_by_us(new_url(f"ours{turn}"), spool, folder / f"drained{turn}", events))
+        ours.append(store_by_us(here.new_url(f"{folder.name}/ours{turn}"), spool, folder / f"drained{turn}", events))
     shutil.rmtree(spooled)
     times_faster = [one["seconds"] / other["seconds"] for one, other in zip(baseline, ours, strict=True)]
     return {
@@ -142,13 +150,8 @@ def compare(task_tree: Tree, folder: Path, *, seed: int, repeat: int, server: Se
     }
 
 
-def _new_url(folder: Path, server: Server | None, name: str) -> str:
-    return server.new_database() if server else f"sqlite:///{folder}/{name}.db"
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="300 nodes, on both databases")
+    parser = options(__doc__, quick="300 nodes, on both databases")
     parser.add_argument("--postgresql", action="store_true", help="use a new PostgreSQL server")
     parser.add_argument("--nodes", type=int, nargs="+", default=[1_000, 10_000, 50_000])
     parser.add_argument("--repeat", type=int, default=3, help="turns of each side")
@@ -165,37 +168,25 @@ def main() -> None:
         )
     databases = ["sqlite", "postgresql"] if arguments.quick else ["postgresql" if arguments.postgresql else "sqlite"]
     result: dict[str, Any] = {"bench": "thesis", "seed": arguments.seed, "repeat": repeat}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        for database in databases:
-            if database == "postgresql" and find_spec("psycopg") is None:
-                result[database] = MISSING
-                continue
-            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
-            result[database] = [measure_size(size, folder, arguments.seed, repeat, server) for size in sizes]
+    for database in databases:
+        if database == "postgresql" and find_spec("psycopg") is None:
+            result[database] = MISSING
+            continue
+        with place(database) as here:
+            result[database] = [measure_size(size, here, arguments.seed, repeat) for size in sizes]
     print(json.dumps(result))
     console().print(_table(result))
 
 
-def measure_size(size: int, parent: Path, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
+def measure_size(size: int, here: Place, seed: int, repeat: int) -> dict[str, Any]:
     console().print(f"{size:,} nodes …")
-    with tempfile.TemporaryDirectory(dir=parent) as folder:
-        return compare(tree(size, seed), Path(folder), seed=seed, repeat=repeat, server=server)
+    with tempfile.TemporaryDirectory(dir=here.folder) as folder:
+        return compare(tree(size, seed), Path(folder), here, seed=seed, repeat=repeat)
 
 
 def _table(result: dict[str, Any]) -> Table:
-    table = Table(title="Task trees to rows in all tables", title_justify="left")
-    for name in (
-        "database",
-        "nodes",
-        "thesis, nodes/s",
-        "ours, nodes/s",
-        "times faster",
-        "times less CPU",
-        "MB",
-        "MB, ours",
-    ):
-        table.add_column(name, justify="left" if name == "database" else "right")
+    header = "database: | nodes | thesis, nodes/s | ours, nodes/s | times faster | times less CPU | MB | MB, ours"
+    table = table_of("Task trees to rows in all tables", header)
     for database in ("sqlite", "postgresql"):
         if result.get(database) == MISSING:
             table.add_row(database, MISSING)

@@ -16,34 +16,22 @@ import json
 import sqlite3
 import subprocess
 import sys
-import tempfile
 import time
 from bisect import bisect_left
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import asyncpg
-from rich.table import Table
 
-from bench.reporting.figures import console, percentiles
+from bench.material.runs import DATABASES, NoteActionPerformable, options, place
+from bench.reporting.figures import console, percentiles, table_of
 from pycrorm_async import Memory
-from pycrorm_async.plan import ActionAbstract
-from tests.databases import ask, server_in
+from tests.databases import ask
 
 _POLL_S = 0.002
 _RATES = (100, 1_000, 10_000)
 _CHECKPOINT = "SELECT folded, head, ended_wall_ns FROM episode ORDER BY number DESC LIMIT 1"
-
-
-@dataclass
-class NoteActionPerformable(ActionAbstract):
-    text: str
-    weight: float
-
-    async def perform(self) -> None: ...
 
 
 async def record(url: str, spool: Path, rate: int, seconds: float) -> dict[str, Any]:
@@ -112,23 +100,20 @@ async def watch(url: str) -> None:
     print(json.dumps(readings))
 
 
-def measure(rates: tuple[int, ...], seconds: float, stack: ExitStack) -> dict[str, Any]:
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-    server = stack.enter_context(server_in(folder / "pg"))
+def measure(rates: tuple[int, ...], seconds: float) -> dict[str, Any]:
     result: dict[str, Any] = {}
-    for database in ("sqlite", "postgresql"):
-        result[database] = {}
-        for rate in rates:
-            console().print(f"{database}, {rate:,} events/s …")
-            url = server.new_database() if database == "postgresql" else f"sqlite:///{folder}/{rate}.db"
-            spool = folder / f"{database}{rate}.spool"
-            result[database][str(rate)] = asyncio.run(record(url, spool, rate, seconds))
+    for database in DATABASES:
+        with place(database) as here:
+            result[database] = {}
+            for rate in rates:
+                console().print(f"{database}, {rate:,} events/s …")
+                spool = here.folder / f"{rate}.spool"
+                result[database][str(rate)] = asyncio.run(record(here.new_url(f"{rate}"), spool, rate, seconds))
     return result
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two rates, half a second each")
+    parser = options(__doc__, quick="two rates, half a second each")
     parser.add_argument("--seconds", type=float, default=10.0, help="duration of each rate")
     parser.add_argument("--watch", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -136,12 +121,10 @@ def main() -> None:
         asyncio.run(watch(arguments.watch))
         return
     rates, seconds = (_RATES[:2], 0.5) if arguments.quick else (_RATES, arguments.seconds)
-    with ExitStack() as stack:
-        result = {"bench": "visible", "seconds": seconds, **measure(rates, seconds, stack)}
+    result = {"bench": "visible", "seconds": seconds, **measure(rates, seconds)}
     print(json.dumps(result))
-    table = Table(title="From the return of a perform to its rows, ms", title_justify="left")
-    for name in ("database", "requested, events/s", "reached", "median", "p99", "p99.9", "max"):
-        table.add_column(name, justify="left" if name == "database" else "right")
+    header = "database: | requested, events/s | reached | median | p99 | p99.9 | max"
+    table = table_of("From the return of a perform to its rows, ms", header)
     for database in ("sqlite", "postgresql"):
         for rate, figures in result[database].items():
             table.add_row(

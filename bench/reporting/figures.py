@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
+from rich.table import Table
 
 # === figures ==================================================================================================
 #
@@ -72,6 +73,14 @@ def memory_free_gb() -> float:
 def console() -> Console:
     """Return a console on stderr for progress and tables, because stdout holds only JSON."""
     return Console(stderr=True, width=None if sys.stderr.isatty() else 140)
+
+
+def table_of(title: str, header: str) -> Table:
+    """Return an empty table; its header has the names of columns between bars, with a colon behind those of texts."""
+    table = Table(title=title, title_justify="left")
+    for name in map(str.strip, header.split("|")):
+        table.add_column(name.removesuffix(":"), justify="left" if name.endswith(":") else "right")
+    return table
 
 
 # === machine ==================================================================================================
