@@ -163,28 +163,6 @@ def test_more_fields_than_slots_are_refused() -> None:
     assert fault_in_fields([declared(f"f{n}") for n in range(31)]) == "it has 31 fields, at most 30 are allowed"
 
 
-CLASHING: st.SearchStrategy[FieldDeclared] = st.builds(
-    declared,
-    st.sampled_from(["pose", "Pose", "pose_id", "object", "object_id", "a", "A", "a_id", "id", "true", "x" * 61]),
-    st.sampled_from(["pose", "object", "text"]),
-)
-
-
-@given(st.lists(CLASHING, max_size=12))
-def test_a_field_checked_beside_the_accepted_ones_has_the_fault_that_all_of_them_together_have(
-    fields: list[FieldDeclared],
-) -> None:
-    accepted: list[FieldDeclared] = []
-    columns = AcceptedFields()
-    for field in fields:
-        fault = columns.fault_in(field)
-        assert fault == fault_in_fields([*accepted, field])
-        if fault is None:
-            accepted.append(field)
-            columns.accept(field)
-    assert columns.count == len(accepted)
-
-
 def test_a_field_beside_as_many_as_there_are_slots_is_refused() -> None:
     columns = AcceptedFields()
     for number in range(30):
@@ -198,11 +176,6 @@ def test_the_name_of_a_table_of_the_memory_itself_is_refused(table: str) -> None
     fault = fault_in_table(table)
     assert fault is not None
     assert table in fault
-
-
-@pytest.mark.parametrize("table", ["saying_action", "saying__action", "saying action!"])
-def test_another_printable_name_of_a_table_is_free(table: str) -> None:
-    assert fault_in_table(table) is None
 
 
 @pytest.mark.parametrize("table", ["", " ", "saying\naction", 'saying"action'])
@@ -227,11 +200,6 @@ def test_the_largest_row_id_of_version_0_1_0_is_exact_as_a_float_and_the_largest
     assert largest == 9_007_199_254_740_991  # 2**53 - 1
     assert json.loads(json.dumps({"id": largest}), parse_int=float)["id"] == largest
     assert row_id(2_147_483_647, 67_108_863, 31) == 2**62 - 1
-
-
-def test_a_row_id_is_packed_as_documented() -> None:
-    assert row_id(1, 2, 3) == 2_147_483_648 + 64 + 3
-    assert row_key(2_147_483_715) == (1, 2, 3)
 
 
 @given(numbers, sequences, slots)

@@ -106,18 +106,6 @@ def named(statuses: Sequence[str]) -> list[Status]:
 # Behaviour trees of py_trees are remembered: activations, pre-emption, feedback, repeats, and the blackboard.
 
 
-def test_each_activation_is_one_node_below_that_of_its_parent(tmp_path: Path) -> None:
-    grasp = Scripted("grasp", named("RRSRF"))
-    status = remembered(tmp_path, sequence("job", grasp, memory=True), lambda ticked: tick(ticked, 5))
-    assert nodes(tmp_path) == [
-        ("job", None, "SUCCEEDED", 3, None),
-        ("grasp", "job", "SUCCEEDED", 3, None),
-        ("job", None, "FAILED", 2, None),
-        ("grasp", "job", "FAILED", 2, None),
-    ]
-    assert status.faults.total == 0
-
-
 def test_feedback_is_the_message_of_a_failure_and_in_the_result_of_a_success(tmp_path: Path) -> None:
     root = selector("job", Scripted("grasp", named("F"), "it is slippery"), Scripted("ask", named("S"), "a human came"))
     remembered(tmp_path, root, lambda ticked: tick(ticked, 1))
@@ -294,31 +282,6 @@ def test_an_exception_in_a_behaviour_reaches_the_program_and_ends_its_branch_as_
         ("grasp", "arm", "ERROR", "no power"),
     ]
     assert_verified(tmp_path)
-
-
-def test_ctrl_c_in_a_behaviour_is_recorded_and_reaches_the_program(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        remembered(tmp_path, sequence("job", Broken("drive", KeyboardInterrupt())), lambda ticked: tick(ticked, 1))
-    assert [each[:3] for each in nodes(tmp_path)] == [("job", None, "CANCELLED"), ("drive", "job", "CANCELLED")]
-    assert ask(tmp_path / "memory.db", "SELECT status FROM process_metadata") == [("INTERRUPTED",)]
-
-
-def test_a_subtree_that_replaces_another_while_the_tree_runs_is_recorded(tmp_path: Path) -> None:
-    root = parallel("job", Scripted("drive", named("R")), Scripted("look", named("R")))
-
-    def run(ticked: Any) -> None:
-        ticked.tick()
-        ticked.replace_subtree(root.children[0].id, sequence("new", Scripted("grasp", named("R"))))
-        ticked.tick()
-
-    remembered(tmp_path, root, run)
-    assert [each[:3] for each in nodes(tmp_path)] == [
-        ("job", None, "INTERRUPTED"),
-        ("drive", "job", "INTERRUPTED"),
-        ("look", "job", "INTERRUPTED"),
-        ("new", "job", "INTERRUPTED"),
-        ("grasp", "new", "INTERRUPTED"),
-    ]
 
 
 def test_a_tree_that_is_part_of_a_larger_one_is_recorded_from_its_own_root(tmp_path: Path) -> None:

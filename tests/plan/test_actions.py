@@ -11,7 +11,6 @@ import pytest
 from pycrorm_async.plan import (
     FaceAtPerformable,
     IKError,
-    LookAtActionPerformable,
     MoveAndPickUpPerformable,
     MoveTCPMotion,
     MoveTorsoActionPerformable,
@@ -19,9 +18,6 @@ from pycrorm_async.plan import (
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
-    ResolutionError,
-    SetGripperActionPerformable,
-    TaskStatus,
     TransportActionPerformable,
     collected_tree,
 )
@@ -33,7 +29,7 @@ from pycrorm_async.plan.failures import (
 )
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.plan.task import CollectedTree
-from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose
+from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene
 
@@ -80,17 +76,6 @@ async def test_the_approach_follows_the_direction_of_the_gripper_at_its_start(sc
     before = targets(tree)[0]
     assert list(before.position) == pytest.approx([1.3 - 0.1 * math.cos(0.5), 1 - 0.1 * math.sin(0.5), 0.9], abs=1e-6)
     assert before.orientation == pytest.approx((0, 0, 0, 1))
-
-
-async def test_picking_up_an_unreachable_object_fails_at_the_first_motion(scene: Scene) -> None:
-    with collected_tree() as tree, pytest.raises(IKError) as caught:
-        await PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT).perform()
-    assert (caught.value.arm, caught.value.tip_frame) == (Arms.RIGHT, RIGHT_TOOL)
-    assert [(type(node.designator).__name__, node.status) for node in tree] == [
-        ("PickUpActionPerformable", TaskStatus.FAILED),
-        ("MoveTCPMotion", TaskStatus.FAILED),
-    ]
-    assert scene.robot.attachments == {}
 
 
 async def test_furniture_and_robots_are_not_picked_up_however_near_they_are(scene: Scene) -> None:
@@ -198,27 +183,6 @@ async def test_the_torso_moves_up_within_its_limits(scene: Scene) -> None:
     assert shape(tree) == ["MoveTorsoActionPerformable", "  MoveJointsMotion"]
     with pytest.raises(TorsoGoalUnreachable):
         await MoveTorsoActionPerformable(1.0).perform()
-
-
-async def test_gripper_and_look_at_are_one_motion_each(scene: Scene) -> None:
-    with collected_tree() as tree:
-        await SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
-        await LookAtActionPerformable(Pose([1.3, 1, 0.9])).perform()
-    assert shape(tree) == [
-        "SetGripperActionPerformable",
-        "  MoveGripperMotion",
-        "LookAtActionPerformable",
-        "  LookingMotion",
-    ]
-
-
-def test_an_action_can_be_built_from_its_fields_alone(scene: Scene) -> None:
-    with pytest.raises(ResolutionError, match="grasp: expected Grasp, got str 'front'"):
-        PickUpActionPerformable(scene.milk, Arms.LEFT, "front")  # type: ignore[arg-type]  # the fault here
-    with pytest.raises(ResolutionError, match="missing: target_location"):
-        NavigateActionPerformable(None)  # type: ignore[arg-type]  # the fault here
-    with pytest.raises(ResolutionError, match="object_designator: expected"):
-        PickUpActionPerformable("milk", Arms.LEFT, Grasp.FRONT)  # type: ignore[arg-type]  # the fault here
 
 
 # === default policy ===========================================================================================

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import inspect
 from collections.abc import Callable, Coroutine
@@ -125,12 +124,6 @@ def test_an_own_dtype_is_used_and_not_inherited() -> None:
     assert (Waving.concept, WavingTwice.concept) == (None, "Gesturing")
 
 
-async def test_super_perform_belongs_to_the_node_of_the_outer_call() -> None:
-    with collected_tree() as tree:
-        assert await WhisperingActionPerformable("Hello").perform() == "hello"
-    assert [type(node.designator).__name__ for node in tree] == ["WhisperingActionPerformable"]
-
-
 async def test_super_perform_makes_one_node_over_three_generations_and_two_bases() -> None:
     calls: list[str] = []
 
@@ -251,10 +244,6 @@ def test_a_motion_names_the_property_that_is_missing_or_wrong(
     assert all(each in str(caught.value) for each in (*missing, *wrong))
 
 
-def test_an_integer_is_accepted_as_a_float() -> None:
-    assert HummingMotion(440, [], Pose()).tone == 440
-
-
 def test_a_motion_whose_annotations_cannot_be_read_is_not_checked() -> None:
     class Note: ...
 
@@ -265,10 +254,6 @@ def test_a_motion_whose_annotations_cannot_be_read_is_not_checked() -> None:
         async def perform(self) -> None: ...
 
     assert Whistle("c").note == "c"  # type: ignore[arg-type, comparison-overlap]  # shows that nothing is checked
-
-
-def test_perform_runs_outside_any_plan() -> None:
-    assert asyncio.run(SayingActionPerformable("alone").perform()) == "ALONE"
 
 
 # === descriptions =============================================================================================

@@ -25,18 +25,14 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     NoRobotHere,
     ObjectPart,
-    OpenAction,
     OpenActionPerformable,
     OpeningMotion,
     ParkArmsActionPerformable,
     ResolutionError,
-    Retry,
-    SimulatedTaskTree,
     collected_tree,
 )
 from pycrorm_async.plan.execution import Candidate
 from pycrorm_async.plan.failures import (
-    CapabilityAbsenceFailure,
     EnvironmentManipulationImpossible,
     EnvironmentUnreachable,
     IllPosedGoalFailure,
@@ -143,14 +139,6 @@ async def test_furniture_that_opens_and_closes_moves_in_one_motion_with_the_hand
             f"  {name}ingMotion",
             "  MoveGripperMotion",
         ]
-
-
-async def test_the_approach_follows_the_direction_of_the_grasp(scene: Scene) -> None:
-    part = await SINK.base_placed_by(scene)
-    with collected_tree() as tree:
-        await GraspingActionPerformable(SINK.arm, part).perform()
-    before, at = (node.designator.target for node in tree if isinstance(node.designator, MoveTCPMotion))
-    np.testing.assert_allclose([before.position, at.position], [(0.9, 1.3, 0.665), (1.0, 1.3, 0.665)], atol=1e-9)
 
 
 async def test_the_hand_keeps_its_grip(scene: Scene) -> None:
@@ -284,32 +272,6 @@ async def test_an_impossible_access_names_the_reason_and_moves_nothing(
     with pytest.raises(failure, match=message):
         await AccessingMotion(**arguments | changed).perform()  # type: ignore[arg-type]  # by name
     assert scene.world.save_state() == before
-
-
-async def test_a_plan_continues_with_the_next_arm(scene: Scene, one_armed: None) -> None:
-    part = await SINK.base_placed_by(scene)
-    right, left = OpenAction(part, [Arms.RIGHT]), OpenAction(part, [Arms.LEFT])
-    with collected_tree() as tree:
-        await (right - left).perform()
-    check(scene, SINK, SINK.goal)
-    tried = [node.failure for node in tree if isinstance(node.designator, OpenActionPerformable)]
-    assert [type(each) for each in tried] == [CapabilityAbsenceFailure, type(None)]
-    scene.kitchen.set_joint_position("sink_area_drawer_joint", 0.0)
-    with collected_tree() as tree:
-        await Retry(OpenAction(part, [Arms.BOTH, Arms.RIGHT, Arms.LEFT]), max_tries=3).perform()
-    check(scene, SINK, SINK.goal)
-    tried = [node.failure for node in tree if isinstance(node.designator, OpenActionPerformable)]
-    assert [type(each) for each in tried] == [IllPosedGoalFailure, CapabilityAbsenceFailure, type(None)]
-
-
-async def test_opening_in_a_simulation_opens_nothing(scene: Scene) -> None:
-    part = await SINK.base_placed_by(scene)
-    before = scene.world.save_state()
-    with SimulatedTaskTree():
-        await OpenActionPerformable(part, SINK.arm).perform()
-        assert part.pose.position == pytest.approx((0.7, 1.3, 0.665), abs=1e-9)
-    assert scene.world.save_state() == before
-    assert part.pose.position == pytest.approx((1.0, 1.3, 0.665), abs=1e-9)
 
 
 # === articulation =============================================================================================

@@ -20,7 +20,6 @@ from pycrorm_async.plan import (
     MoveTorsoAction,
     NavigateAction,
     NavigateActionPerformable,
-    Outcome,
     Parallel,
     ParkArmsAction,
     PickUpAction,
@@ -35,10 +34,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.plan.language import Composable, Expression
 from pycrorm_async.world import Arms, Grasp, Pose
-from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
-
-OPERATORS = "__add__ __sub__ __or__ __xor__ __mul__ __rmul__ __rshift__".split()
 
 
 def navigate(x: float = 1.0, y: float = 1.0) -> NavigateAction:
@@ -51,13 +47,6 @@ def park() -> ParkArmsAction:
 
 LEFT, RIGHT = (PickUpAction([], [arm], [Grasp.FRONT]) for arm in (Arms.LEFT, Arms.RIGHT))
 A, B, C, D = navigate(), park(), MoveTorsoAction([0.3]), navigate(2.0)
-
-
-def test_every_designator_description_and_expression_has_the_operators() -> None:
-    for each in (A, A.resolve(), Code(print), A + B):
-        assert isinstance(each, Composable)
-        assert all(hasattr(each, operator) for operator in OPERATORS)
-    assert isinstance(A + B, Expression)
 
 
 EXPRESSIONS: list[tuple[Expression, type[Expression], tuple[Composable, ...]]] = [
@@ -86,14 +75,6 @@ def test_an_operator_makes_an_expression_of_its_kind_without_nesting_it_in_anoth
         assert not isinstance(plan, Repeat) or plan.times == 5
 
 
-def test_expressions_of_different_kinds_nest() -> None:
-    plan = A + B | C
-    assert type(plan) is Parallel
-    sequence, lift = plan.operands
-    assert isinstance(sequence, Sequential)
-    assert (sequence.operands, lift) == ((A, B), C)
-
-
 def test_code_is_a_designator_of_its_function() -> None:
     code = Code(math.hypot)
     assert isinstance(code, Designator)
@@ -101,18 +82,6 @@ def test_code_is_a_designator_of_its_function() -> None:
     assert (code.function, code.arguments) == ("math.hypot", {})
     with pytest.raises(NotALanguageExpression, match="Code needs a function, got 3"):
         Code(3)  # type: ignore[arg-type]  # what is refused
-
-
-def test_a_monitor_has_the_name_of_its_condition_and_one_operand() -> None:
-    def sees_milk() -> bool:
-        return True
-
-    sequence = A + B
-    plan = sequence >> Monitor(sees_milk)
-    assert type(plan) is Monitor
-    assert plan.operands == (sequence,)
-    assert plan.condition.endswith("<locals>.sees_milk")
-    assert plan.interval_s == 0.1
 
 
 @pytest.mark.parametrize(
@@ -134,16 +103,6 @@ def test_an_impossible_expression_is_refused_when_it_is_made(make: Callable[[], 
         make()
 
 
-async def test_designators_are_performed_in_order(scene: Scene) -> None:
-    outcome = await (navigate(0.3, 0.3) + MoveTorsoAction([0.3]) + park()).perform()
-    assert outcome == Outcome((None, None, None), (0, 1, 2))
-    assert scene.robot.pose.position == pytest.approx((0.3, 0.3, 0))
-    assert scene.robot.joint_position("torso_lift_joint") == pytest.approx(0.3)
-    for arm in PR2.arms.values():
-        for joint, position in arm.park.items():
-            assert scene.robot.joint_position(joint) == pytest.approx(position)
-
-
 async def test_code_may_be_a_function_or_a_coroutine_function() -> None:
     def add(a: int, b: int) -> int:
         return a + b
@@ -154,20 +113,6 @@ async def test_code_may_be_a_function_or_a_coroutine_function() -> None:
 
     outcome = await (Code(add, a=2, b=40) + Code(slowly, text="done")).perform()
     assert outcome.results == (42, "done")
-
-
-async def test_branches_are_tasks_with_names() -> None:
-    seen: list[asyncio.Task[None] | None] = []
-    plan = Code(lambda: seen.append(asyncio.current_task())) | Code(lambda: seen.append(asyncio.current_task()))
-    await plan.perform()
-    assert len({*seen, asyncio.current_task()}) == 3
-    assert [task.get_name() for task in seen if task is not None] == ["Parallel 0: Code", "Parallel 1: Code"]
-
-
-async def test_a_repetition_returns_the_result_of_each_round() -> None:
-    count = iter(range(1, 11))
-    outcome = await (Code(lambda: next(count)) * 10).perform()
-    assert (outcome.rounds, outcome.results) == (10, tuple(range(1, 11)))
 
 
 @pytest.mark.parametrize(

@@ -80,17 +80,6 @@ async def test_of_many_failures_ten_are_named() -> None:
     assert len(caught.value.exceptions) == 14
 
 
-async def test_a_plan_can_continue_after_one_class_of_failure_and_not_after_another() -> None:
-    handled: list[str] = []
-    with pytest.raises(PlanFailures) as caught:
-        try:
-            await (Step("a", fails=ObjectLost("gone")) | Step("b", fails=ObjectUnreachable("far"))).perform()
-        except* ObjectLost as lost:
-            handled += map(str, lost.exceptions)
-    assert handled == ["gone"]
-    assert [str(each) for each in caught.value.exceptions] == ["far"]
-
-
 async def test_an_exception_group_of_the_plan_counts_as_a_failure() -> None:
     class AtOnce(ActionAbstract):
         async def perform(self) -> None:

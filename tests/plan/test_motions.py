@@ -85,18 +85,6 @@ async def test_the_tool_frame_is_at_its_target(scene: Scene, watching: Watching)
     assert watching.seen == ["joints 7"]
 
 
-async def test_a_goal_out_of_reach_is_an_ik_error_and_moves_nothing(scene: Scene, watching: Watching) -> None:
-    goal = Pose([3, 0, 1])
-    with pytest.raises(IKError) as caught:
-        await MoveTCPMotion(goal, Arms.RIGHT).perform()
-    assert (caught.value.pose, caught.value.arm, caught.value.tip_frame) == (
-        goal,
-        Arms.RIGHT,
-        "r_gripper_tool_frame",
-    )
-    assert watching.seen == []
-
-
 @pytest.mark.parametrize("grippers", [(Arms.LEFT, "l"), (Arms.RIGHT, "r"), (Arms.BOTH, "lr")])
 async def test_a_gripper_opens_and_closes(scene: Scene, watching: Watching, grippers: tuple[Arms, str]) -> None:
     gripper, sides = grippers
@@ -174,13 +162,6 @@ async def test_the_camera_looks_at_the_point(
     assert list(ahead) == pytest.approx([each / length for each in way], abs=1e-6)
 
 
-async def test_looking_twice_changes_nothing(scene: Scene) -> None:
-    await LookingMotion(Pose([1.3, 1.0, 0.9])).perform()
-    once = scene.robot.joint_positions()
-    await LookingMotion(Pose([1.3, 1.0, 0.9])).perform()
-    assert scene.robot.joint_positions() == pytest.approx(once, abs=1e-9)
-
-
 async def test_the_neck_turns_as_far_as_it_can_to_a_point_behind(scene: Scene, watching: Watching) -> None:
     await LookingMotion(Pose([-1, -0.01, 5])).perform()
     pan, tilt = scene.robot.joint_limits("head_pan_joint"), scene.robot.joint_limits("head_tilt_joint")
@@ -199,17 +180,6 @@ async def test_the_head_does_not_turn_to_a_point_outside_the_map(
     with pytest.raises(CallerError, match=message):
         await LookingMotion(target).perform()
     assert watching.seen == []
-
-
-def test_a_motion_requires_its_properties() -> None:
-    with pytest.raises(ResolutionError, match=r"target: expected Pose, got list \[1, 2, 3\]"):
-        MoveMotion([1, 2, 3])  # type: ignore[arg-type]  # the fault this test is about
-    with pytest.raises(ResolutionError, match="arm: expected Arms, got str 'left'"):
-        MoveTCPMotion(Pose(), "left")  # type: ignore[arg-type]  # the fault this test is about
-    with pytest.raises(ResolutionError, match="missing: motion"):
-        MoveGripperMotion(None, Arms.LEFT)  # type: ignore[arg-type]  # the fault this test is about
-    with pytest.raises(ResolutionError, match="left_arm_poses"):
-        MoveArmJointsMotion({"l_elbow_flex_joint": "bent"})  # type: ignore[dict-item]  # the fault this test is about
 
 
 # === process modules ==========================================================================================

@@ -142,12 +142,6 @@ def test_the_time_of_a_location_is_now_or_has_a_time_zone(scene: Scene) -> None:
         LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk, datetime(2024, 7, 30))  # noqa: DTZ001
 
 
-def test_an_object_that_is_only_located_is_not_in_the_world(scene: Scene) -> None:
-    cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk)
-    with pytest.raises(PerceptionObjectNotInWorld, match="cup is not an object of the world"):
-        in_world(cup)
-
-
 def test_objects_are_located_relative_to_each_of_the_others(scene: Scene) -> None:
     scene.cereal.set_pose(Pose([1.3, 0.7, 0.95], yaw_quaternion(math.pi / 2)))
     food = [ObjectType.MILK, ObjectType.BREAKFAST_CEREAL]

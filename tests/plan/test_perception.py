@@ -20,18 +20,16 @@ from pycrorm_async.plan import (
     ObjectDesignator,
     ObjectDesignatorDescription,
     PickUpActionPerformable,
-    ResolutionError,
     TaskStatus,
     WorldStateDetectingMotion,
     collected_tree,
 )
-from pycrorm_async.plan.execution import Seen, recorder
+from pycrorm_async.plan.execution import Seen
 from pycrorm_async.plan.failures import PerceptionObjectNotFound
 from pycrorm_async.plan.motions import SimulatedModules
 from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.world import Arms, Grasp, Limits, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
-from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
@@ -236,15 +234,6 @@ async def test_world_state_detection_returns_the_first_of_a_type_seen_or_not(
     assert (await WorldStateDetectingMotion(ObjectType.ROBOT).perform()).world_object is scene.robot
 
 
-async def test_perceiving_moves_nothing_and_needs_no_memory(scene: Scene) -> None:
-    assert recorder.get() is None
-    await facing(scene, scene.milk)
-    before = scene.world.save_state()
-    await DetectingMotion(ObjectType.MILK).perform()
-    await WorldStateDetectingMotion(ObjectType.BREAKFAST_CEREAL).perform()
-    assert scene.world.save_state() == before
-
-
 class Seeing(SimulatedModules):
     """A user's robot whose camera reports what the test chooses."""
 
@@ -263,9 +252,3 @@ async def test_percepts_of_a_users_robot_are_recorded_too(scene: Scene, listenin
     with ChosenRobot("blind", Seeing()), pytest.raises(PerceptionObjectNotFound, match="no MILK was perceived"):
         await DetectingMotion(ObjectType.MILK).perform()
     assert [each[2] for each in listening.detections] == [seen, ()]
-
-
-def test_a_search_needs_an_object_type(scene: Scene) -> None:
-    with pytest.raises(ResolutionError, match="object_type: expected ObjectType, got str 'MILK'"):
-        DetectingMotion("MILK")  # type: ignore[arg-type]  # the fault this test is about
-    assert PR2.camera_view_rad == (0.99483, 0.75049)

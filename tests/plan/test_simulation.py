@@ -19,15 +19,12 @@ from pycrorm_async.plan import (
     MoveAndPickUpPerformable,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
-    ObjectDesignator,
     ObjectDesignatorDescription,
     ObjectPart,
     PickUpActionPerformable,
-    PlaceActionPerformable,
     SimulatedTaskTree,
     TransportActionPerformable,
     collected_tree,
-    simulated_robot,
 )
 from pycrorm_async.plan.execution import current_simulation
 from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
@@ -106,17 +103,6 @@ async def test_the_result_of_a_simulation_comes_true_to_the_last_bit(scene: Scen
     assert scene.cereal.pose.distance(target) < 0.01
 
 
-async def test_a_simulation_without_a_world_is_only_a_tree_of_its_own() -> None:
-    @dataclass
-    class NothingActionPerformable(ActionAbstract):
-        async def perform(self) -> None:
-            assert current_world.get() is None
-
-    with collected_tree() as around, SimulatedTaskTree() as tree:
-        await NothingActionPerformable().perform()
-    assert (len(around), len(tree)) == (0, 1)
-
-
 async def test_a_simulation_has_its_own_root_and_the_tree_around_continues_without_it(scene: Scene) -> None:
     with collected_tree() as around:
         pose, inner = await ThinkActionPerformable(THERE).perform()
@@ -183,25 +169,6 @@ async def test_simulations_nest(scene: Scene) -> None:
     assert scene.robot.pose == Pose()
 
 
-async def test_two_tasks_simulate_concurrently_while_a_third_acts(scene: Scene) -> None:
-    ready = asyncio.Barrier(3)
-
-    async def dreaming(x: float) -> tuple[Pose, int]:
-        with SimulatedTaskTree() as tree:
-            await ready.wait()
-            await NavigateActionPerformable(Pose([x, 0, 0])).perform()
-            await asyncio.sleep(0.01)
-            return in_world(scene.robot).pose, len(tree)
-
-    async def acting() -> None:
-        await ready.wait()
-        await NavigateActionPerformable(THERE).perform()
-
-    first, second, _ = await asyncio.gather(dreaming(1), dreaming(2), acting())
-    assert (first, second) == ((Pose([1, 0, 0]), 2), (Pose([2, 0, 0]), 2))
-    assert scene.robot.pose == THERE
-
-
 async def test_a_task_begun_in_a_simulation_uses_the_copy_and_then_finds_it_closed(scene: Scene) -> None:
     closing = asyncio.Event()
 
@@ -217,35 +184,6 @@ async def test_a_task_begun_in_a_simulation_uses_the_copy_and_then_finds_it_clos
     with pytest.raises(WorldClosed):
         await task
     assert scene.robot.pose == Pose()
-
-
-async def test_the_recorder_is_notified_when_a_simulation_begins_and_ends(scene: Scene) -> None:
-    listening = Recording()
-    with listening.listening():
-        with SimulatedTaskTree(description="what if"):
-            await NavigateActionPerformable(THERE).perform()
-        with pytest.raises(ValueError, match="sour"), SimulatedTaskTree():
-            raise ValueError("sour")
-    assert listening.notes == [
-        "think what if",
-        "start NavigateActionPerformable",
-        "start MoveMotion",
-        "end MoveMotion SUCCEEDED",
-        "end NavigateActionPerformable SUCCEEDED",
-        "thought through",
-        "think None",
-        "thought ValueError",
-    ]
-
-
-async def test_a_robot_chosen_inside_a_simulation_is_not_chosen_outside() -> None:
-    with BulletWorld() as world:
-        robot = Object("pr2", ObjectType.ROBOT)
-        with SimulatedTaskTree(), simulated_robot:
-            await NavigateActionPerformable(THERE).perform()
-        with pytest.raises(CallerError, match="robot"):
-            await NavigateActionPerformable(THERE).perform()
-        assert (robot.pose, world.robot) == (Pose(), robot)
 
 
 def test_a_simulation_is_entered_once_and_described_in_words() -> None:
@@ -314,21 +252,6 @@ async def test_a_world_object_as_an_argument_refers_to_the_copy_too(scene: Scene
     assert scene.robot.pose == Pose()
 
 
-async def test_a_held_object_is_held_in_the_copy(scene: Scene) -> None:
-    await MoveTorsoActionPerformable(0.3).perform()
-    await NavigateActionPerformable(AT_THE_CEREAL).perform()
-    await PickUpActionPerformable(scene.cereal, Arms.RIGHT, Grasp.FRONT).perform()
-    held_at = scene.cereal.pose
-    with SimulatedTaskTree():
-        await NavigateActionPerformable(AT_THE_CEREAL).perform()
-        target = Pose([1.3, 0.6, 0.95])
-        await PlaceActionPerformable(scene.cereal, Arms.RIGHT, target).perform()
-        assert designator_of(scene.cereal).pose.distance(target) < 0.01
-        assert in_world(scene.cereal).attached_to is None
-    assert scene.cereal.attached_to is scene.robot
-    assert scene.cereal.pose == held_at
-
-
 async def test_locations_are_resolved_in_the_copy_to_plain_poses(scene: Scene) -> None:
     """The milk is moved in the simulation, and the base poses are beside its simulated pose."""
     with SimulatedTaskTree():
@@ -389,13 +312,3 @@ async def test_a_designator_resolved_in_one_simulation_refers_to_the_copy_in_the
     with SimulatedTaskTree():
         assert resolved.pose == Pose([1.3, 1, 0.9])
         assert in_world(resolved).world is current_world.get()
-
-
-def test_a_frozen_copy_taken_in_a_simulation_keeps_the_simulated_pose() -> None:
-    with BulletWorld():
-        milk: ObjectDesignator = designator_of(Object("milk", ObjectType.MILK))
-        with SimulatedTaskTree():
-            in_world(milk).set_pose(Pose([4, 0, 0]))
-            frozen = milk.frozen_copy()
-        assert frozen.pose == Pose([4, 0, 0])
-        assert milk.pose == Pose()

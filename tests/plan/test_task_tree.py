@@ -76,12 +76,6 @@ async def test_a_tree_is_drawn_with_its_branches_in_order() -> None:
     assert tree.children(tree.roots[0]) == tuple(node for node in tree if node.parent is tree.roots[0])
 
 
-async def test_an_empty_tree_is_drawn_as_nothing() -> None:
-    with collected_tree() as tree:
-        pass
-    assert (str(tree), len(tree), list(tree)) == ("", 0, [])
-
-
 async def test_a_running_node_is_drawn_without_a_duration() -> None:
     class Looking(ActionAbstract):
         async def perform(self) -> None:

@@ -23,12 +23,14 @@ from pycrorm_async.plan import task
 from pycrorm_async.plan.actions import PickUpActionPerformable
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.objects import ObjectDesignator
-from pycrorm_async.record.declarations import Declared, FieldSpec, KnownTypes, declare_named
+from pycrorm_async.record.declarations import Declared, FieldSpec, KnownTypes
 from pycrorm_async.record.plan_types import Declarations, built_in_declaration, declared_type
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Pose
 from tests.databases import ask
-from tests.record.recordings import assert_verified, events, nodes, url_of
+from tests.record.recordings import assert_verified, events, nodes, record, url_of
 
 # === declaration ==============================================================================================
 #
@@ -304,11 +306,8 @@ async def perform(self: Any) -> None:
 # The words of the plan layer and of the log are the same, though neither imports the other.
 
 
-def test_the_kinds_of_a_node_are_the_same_in_a_plan_and_in_the_log() -> None:
+def test_the_kind_and_the_status_of_a_node_are_the_same_in_a_plan_and_in_the_log() -> None:
     assert get_args(task.NodeKind) == get_args(types.NodeKind) == ("root", "action", "motion", "language")
-
-
-def test_the_status_of_a_node_is_the_same_in_a_plan_and_in_the_log() -> None:
     in_the_plan = {status.name: status.value for status in TaskStatus}
     assert in_the_plan == {word: word for word in get_args(types.NodeStatus)}
     assert len(in_the_plan) == 8
@@ -360,18 +359,6 @@ def test_a_field_that_contradicts_a_built_in_type_is_kept_under_its_type(tmp_pat
     assert declared["parameters"] == {"object_designator_text": "milk", "arm": "LEFT", "grasp_real": 1.5}
     concept = "SELECT payload ->> 'concept' FROM pycrorm_declaration"
     assert ask(tmp_path / "memory.db", concept) == [("PickingUp",)]
-
-
-def test_each_memory_searches_the_classes_for_a_built_in_type_once() -> None:
-    searched: list[str] = []
-
-    def find(dtype: str) -> None:
-        searched.append(dtype)
-
-    known_types = KnownTypes(find)
-    for _ in range(2):
-        declare_named("action", "Wipe", {}, known_types)
-    assert searched == ["Wipe"]
 
 
 def test_a_type_is_declared_when_it_is_asked_for_and_has_a_table_without_a_node(tmp_path: Path) -> None:
@@ -446,8 +433,13 @@ def test_a_field_whose_name_cannot_be_a_column_gets_a_similar_one(tmp_path: Path
 
 def test_a_type_whose_name_cannot_be_a_table_gets_a_similar_one(tmp_path: Path) -> None:
     kept = {"Say it!": "Say_it", "__start__": "start", "Event": "EventAction", "": "Unnamed", "7": "action_7"}
-    for dtype in kept:
-        assert recorded(tmp_path, dtype, {"text": "text"}, {"text": "hi"}) == 1
+
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        for dtype in kept:
+            episode.start(dtype, recording.type("action", dtype, {"text": "text"}), {"text": "hi"})
+            episode.end(dtype)
+
+    assert record(tmp_path, write).missing.total == len(kept)
     assert [dtype for dtype, *_ in nodes(tmp_path)] == [*kept.values()]
 
 

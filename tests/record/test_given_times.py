@@ -234,6 +234,7 @@ def test_a_source_that_has_changed_is_refused_in_one_line(tmp_path: Path) -> Non
     assert rows(tmp_path, "SELECT count(*) FROM event") == [(3,)]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_name_and_its_samples_are_found_on_each_database_inside_a_loop(
     database_url: str, tmp_path: Path
 ) -> None:

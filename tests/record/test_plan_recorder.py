@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import zlib
 from collections.abc import Awaitable
 from dataclasses import dataclass
 from pathlib import Path
@@ -288,23 +287,6 @@ async def test_a_description_is_declared_once_by_a_memory_before_the_first_objec
     assert names == [names[0], names[0], names[0], names[3]] * 2
     types = [type(event) for _, _, event in case.sink.records]
     assert types.index(DescriptionDeclared) + 1 == types.index(ObjectAdded)
-
-
-async def test_a_description_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    compressed: list[int] = []
-    compress = zlib.compress
-
-    def counting(text: bytes) -> bytes:
-        compressed.append(len(text))
-        return compress(text)
-
-    monkeypatch.setattr(zlib, "compress", counting)
-    with recorder_case() as case:
-        for number in range(3):
-            with case.episode(), BulletWorld():
-                Object("box", ObjectType.GENERIC_OBJECT, box(7))
-                Object(f"box {number}", ObjectType.GENERIC_OBJECT, box(7))
-    assert compressed == [len(box(7))]
 
 
 @pytest.mark.slow

@@ -14,13 +14,10 @@ import pytest
 
 from pycrorm_async import Settings
 from pycrorm_async.events.types import (
-    EpisodeStatus,
     FailureValue,
     NodeEnded,
     NodeStarted,
-    ObjectReference,
     PoseValue,
-    RobotValue,
     SeenValue,
 )
 from pycrorm_async.plan.failures import NavigationGoalInCollision
@@ -67,32 +64,6 @@ def test_a_joint_at_its_last_position_is_not_written_again(tmp_path: Path) -> No
 
     assert faults_of(tmp_path, write) == (0, None)
     assert [each["joints"] for each in events(tmp_path, "JointsMoved")] == [{"elbow": 1.0}, {"torso": 0.3}]
-
-
-def test_a_tree_written_by_threads_has_the_parents_that_they_named(tmp_path: Path) -> None:
-    with opened(tmp_path) as memory, memory.recording.episode(description="twenty times three") as episode:
-        parallel = memory.recording.type("language", "Parallel")
-        move = memory.recording.type("motion", "MoveArm", {"number": int})
-        for number in range(20):
-            episode.start(("parallel", number), parallel)
-
-            def branch(key: tuple[int, int], above: int = number) -> None:
-                episode.start(key, move, {"number": above}, parent=("parallel", above))
-                episode.end(key, "FAILED" if key[1] else "SUCCEEDED")
-
-            threads = [threading.Thread(target=branch, args=((number, each),)) for each in range(3)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-            episode.end(("parallel", number))
-    rows = ask(
-        tmp_path / "memory.db",
-        "SELECT node.parent_id, move.number FROM move_arm AS move JOIN task_tree_node AS node ON node.id = move.id",
-    )
-    parents = [each for (each,) in ask(tmp_path / "memory.db", "SELECT id FROM parallel ORDER BY id")]
-    assert sorted(rows) == sorted((parents[number], number) for number in range(20) for _ in range(3))
-    assert_verified(tmp_path)
 
 
 def test_a_call_has_run_when_it_returns_whichever_threads_call_and_one_of_the_memory_does_not_wait(
@@ -259,12 +230,15 @@ def test_an_unknown_parent_is_counted_and_an_ended_one_is_kept(tmp_path: Path) -
     assert [row[1] for row in nodes(tmp_path)] == [None, "Step", None]
 
 
-def test_what_a_start_returned_names_its_node_long_after_its_end(tmp_path: Path) -> None:
+def test_what_a_start_returned_names_its_node_long_after_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keyed_episode, "_ENDED_MAX", 3)
     with opened(tmp_path) as memory, memory.recording.episode() as episode:
         job = memory.recording.type("action", "Job", {"number": int})
         first = episode.start("key", job, {"number": 0})
         episode.end("key")
-        for number in range(1, 1_500):
+        for number in range(1, 20):
             episode.start("key", job, {"number": number})
             episode.end("key")
         episode.observe("ticks", 7, node=first)
@@ -298,33 +272,22 @@ def test_nodes_that_start_below_ended_ones_do_not_keep_all_of_these(
     assert len(nodes(tmp_path)) == 20
 
 
-def test_nodes_open_at_the_end_are_lost_and_counted_once(tmp_path: Path) -> None:
-    def write(recording: Recording, episode: RecordedEpisode) -> None:
-        for key in range(3):
-            episode.start(key, recording.type("action", "Step"))
-
-    total, last = faults_of(tmp_path, write)
-    assert total == 1
-    assert last is not None
-    assert last.endswith("which end LOST: 3")
-    assert [row[2] for row in nodes(tmp_path)] == ["LOST"] * 3
-    assert_verified(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("failure", "status"),
-    [(KeyboardInterrupt(), "CANCELLED"), (asyncio.CancelledError(), "CANCELLED"), (ValueError(), "LOST")],
-)
-def test_nodes_open_at_the_end_of_an_interrupted_episode_end_cancelled(
-    tmp_path: Path, failure: BaseException, status: str
-) -> None:
+def test_nodes_open_at_the_end_are_lost_and_counted_once_or_cancelled_by_an_interruption(tmp_path: Path) -> None:
+    expected = {
+        KeyboardInterrupt(): "CANCELLED",
+        asyncio.CancelledError(): "CANCELLED",
+        ValueError(): "LOST",
+        None: "LOST",
+    }
     with opened(tmp_path) as memory:
-        episode = memory.recording.episode(description="d")
-        for key in range(3):
-            episode.start(key, memory.recording.type("action", "Step"))
-        episode.close(failure)
-        assert memory.status.faults.total == 0
-    assert [row[2] for row in nodes(tmp_path)] == [status] * 3
+        for failure in expected:
+            episode = memory.recording.episode(description="d")
+            for key in range(3):
+                episode.start(key, memory.recording.type("action", "Step"))
+            episode.close(failure)
+            assert memory.status.faults.total == (failure is None)
+        assert str(memory.status.faults.last).endswith("which end LOST: 3")
+    assert [row[2] for row in nodes(tmp_path)] == [status for status in expected.values() for _ in range(3)]
     assert_verified(tmp_path)
 
 
@@ -466,27 +429,17 @@ def test_a_start_waits_until_the_spool_has_room_and_logs_that(
 # The status of a recorded node and of its episode: stated by the executive, or that of the failure.
 
 
-def test_a_status_given_with_a_failure_of_another_language(tmp_path: Path) -> None:
-    with opened(tmp_path) as memory, memory.recording.episode(description="d") as episode:
-        episode.start("a", memory.recording.type("action", "Step"), robot=RobotValue(
-            PoseValue((0, 0, 0), (0, 0, 0, 1), "map", 0), "ROBOT", None, ObjectReference(1, 1), "r"
-        ))  # fmt: skip
-        episode.end("a", "INTERRUPTED", FailureValue("bt.Preempted", "a higher priority"))
-    assert nodes(tmp_path) == [("Step", None, "INTERRUPTED", "a higher priority")]
-
-
-@pytest.mark.parametrize(
-    ("status", "root"), [("FAILED", "FAILED"), ("INTERRUPTED", "CANCELLED"), ("ERROR", "ERROR"), (None, "ERROR")]
-)
-def test_an_executive_states_the_outcome_of_its_own_failure(
-    tmp_path: Path, status: EpisodeStatus | None, root: str
-) -> None:
+def test_an_executive_states_the_outcome_of_its_own_failure(tmp_path: Path) -> None:
+    roots = {"FAILED": "FAILED", "INTERRUPTED": "CANCELLED", "ERROR": "ERROR", None: "ERROR"}
     with opened(tmp_path) as memory:
-        memory.recording.episode(description="d").close(ValueError("a failure of its own"), status)
-    ended = ask(tmp_path / "memory.db", "SELECT status, failure_type, failure_message FROM process_metadata")
-    assert [tuple(each) for each in ended] == [(status or "ERROR", "builtins.ValueError", "a failure of its own")]
-    roots = ask(tmp_path / "memory.db", "SELECT status FROM task_tree_node WHERE kind = 'root'")
-    assert [tuple(each) for each in roots] == [(root,)]
+        for status in roots:
+            memory.recording.episode(description="d").close(ValueError("a failure of its own"), cast("Any", status))
+    ended = ask(
+        tmp_path / "memory.db", "SELECT status, failure_type, failure_message FROM process_metadata ORDER BY id"
+    )
+    assert ended == [(each or "ERROR", "builtins.ValueError", "a failure of its own") for each in roots]
+    own = ask(tmp_path / "memory.db", "SELECT status FROM task_tree_node WHERE kind = 'root' ORDER BY id")
+    assert [status for (status,) in own] == [*roots.values()]
 
 
 class Slip(Exception):

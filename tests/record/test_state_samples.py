@@ -84,20 +84,6 @@ async def test_every_episode_begins_with_all_channels(case: RecorderCase) -> Non
     assert [each.channels["base.x"] for each in whole] == [0.0, 0.5]
 
 
-async def test_a_long_motion_is_sampled_in_between(case: RecorderCase) -> None:
-    steps = [step / 20 for step in range(1, 21)]
-
-    async def drive(body: Object, target: Pose) -> None:
-        for share in steps:
-            body.set_pose(Pose([target.position.x * share, 0, 0]))
-            await seen(case, "base.x", share)
-
-    with case.episode(), ChosenRobot("mine", Robot(drive)):
-        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    assert values(case, "base.x") == [0.0, *steps]
-    assert {tuple(each.channels) for each in samples(case)[1:]} == {("base.x",)}
-
-
 async def test_a_motion_without_an_await_is_sampled_too(case: RecorderCase) -> None:
     def drive(body: Object, target: Pose) -> None:
         for x in (0.5, target.position.x):
