@@ -99,22 +99,17 @@ class PlaceReach(NamedTuple):
     refusal: str | None = None
 
 
-def base_poses(
-    target: Pose | objects.ObjectLike,
-    *,
-    reachable_for: objects.ObjectLike | None,
-    visible_for: objects.ObjectLike | None,
-    reachable_arm: Arms | None,
-) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
+def base_poses(search: CostmapLocation) -> Iterator[Location | Refusal | Cells]:
     """Yield the cells of the costmaps, then base poses that face the target, best first, suitable or not.
 
     For a fixed base yield only its own pose.
     """
-    reacher = resolve_robot(reachable_for) if reachable_for is not None else None
-    viewer = resolve_robot(visible_for) if visible_for is not None else None
+    target = search.target
+    reacher = resolve_robot(search.reachable_for) if search.reachable_for is not None else None
+    viewer = resolve_robot(search.visible_for) if search.visible_for is not None else None
     goal = target if isinstance(target, Pose) else objects.pose_of(target)
     objects.check_in_map(goal)
-    arms = _arms(reacher, reachable_arm, target) if reacher is not None else reachable_arm
+    arms = _arms(reacher, search.reachable_arm, target) if reacher is not None else search.reachable_arm
     if reacher is not None and reacher.description.drive is Drive.FIXED:
         yield _checked(reacher.body.pose, target, goal, reacher, viewer, arms)
         return
@@ -125,17 +120,17 @@ def base_poses(
     clear, height_m = 0, base_height_m(reacher or viewer)
     for cell in _cells(costmap, robots, every=clearance is not None):
         facing = face(cell, goal, height_m=height_m)
-        place = facing, PlaceReach(refusal="no heading was found at which the arm reaches the target")
+        place: Location | Refusal = Refusal(facing, "no heading was found at which the arm reaches the target")
         collision = None
         for base_pose in [facing] if reacher is None else _headings(reacher, arms, facing, target, goal):
             collision = None if clearance is None else clearance.refusal(base_pose)
             if collision is not None:
-                place = base_pose, PlaceReach(refusal=collision)
+                place = Refusal(base_pose, collision)
             elif clear < CELLS_MAX:
                 place = _checked(base_pose, target, goal, reacher, viewer, arms)
             else:
                 return
-            if place[1].refusal is None:
+            if isinstance(place, Location):
                 break
         clear += collision is None
         yield place
@@ -192,14 +187,19 @@ def _checked(
     reacher: objects.CurrentRobot | None,
     viewer: objects.CurrentRobot | None,
     arms: Arms | tuple[Arms, ...] | None,
-) -> tuple[Pose, PlaceReach]:
+) -> Location | Refusal:
     """Return the base pose with the arms that reach the target from there, or with the reason why none does."""
     if viewer is not None and not _sees(viewer, base_pose, target, goal):
-        return base_pose, PlaceReach(refusal="the target is not visible from here")
+        return Refusal(base_pose, "the target is not visible from here")
     if reacher is None:
-        return base_pose, PlaceReach()
+        return Location(base_pose)
     goals = partial(_goals, reacher, base_pose, target, goal)
-    return base_pose, reaching_arms(reacher, arms, base_pose, goals, grasps=not isinstance(target, Pose))
+    reach = reaching_arms(reacher, arms, base_pose, goals, grasps=not isinstance(target, Pose))
+    return _place(base_pose, reach)
+
+
+def _place(base_pose: Pose, reach: PlaceReach) -> Location | Refusal:
+    return Location(base_pose, reach.arms) if reach.refusal is None else Refusal(base_pose, reach.refusal)
 
 
 def resolve_robot(meant: objects.ObjectLike) -> objects.CurrentRobot:
@@ -493,15 +493,7 @@ class CostmapLocation(LocationDesignator):
     reachable_arm: Arms | None = None
 
     def _candidates(self) -> Iterator[Location | Refusal | Cells]:
-        return map(
-            _candidate,
-            base_poses(
-                self.target,
-                reachable_for=self.reachable_for,
-                visible_for=self.visible_for,
-                reachable_arm=self.reachable_arm,
-            ),
-        )
+        return base_poses(self)
 
     def _no_place_failure(self) -> failures.PlanFailure:
         if self.reachable_for is None:
@@ -538,7 +530,7 @@ class AccessingLocation(LocationDesignator):
     arm: Arms | None = None
 
     def _candidates(self) -> Iterator[Location | Refusal | Cells]:
-        return map(_candidate, opening_poses(self.handle, self.robot, self.arm))
+        return opening_poses(self.handle, self.robot, self.arm)
 
     def _no_place_failure(self) -> failures.PlanFailure:
         name = self.handle.name
@@ -574,13 +566,6 @@ class SemanticCostmapLocation(LocationDesignator):
         )
 
 
-def _candidate(searched: tuple[Pose, PlaceReach] | Cells) -> Location | Refusal | Cells:
-    if isinstance(searched, Cells):
-        return searched
-    pose, reach = searched
-    return Location(pose, reach.arms) if reach.refusal is None else Refusal(pose, reach.refusal)
-
-
 # === opening poses ============================================================================================
 #
 # Search base poses from which a robot can open a drawer or a door by its handle and close it again.
@@ -604,8 +589,8 @@ _SWEEP_STEPS = 10
 
 def opening_poses(
     part: objects.ObjectLike, robot: objects.ObjectLike, arm: Arms | None
-) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
-    """Yield the cells of the costmaps, then base poses, best first, each with the arms that reach every goal or none.
+) -> Iterator[Location | Refusal | Cells]:
+    """Yield the cells of the costmaps, then base poses, best first, suitable or not.
 
     Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
     degrees; the places that it sweeps follow in the same order.
@@ -623,9 +608,9 @@ def opening_poses(
                 base_pose = face(cell, handle_pose, height_m=height_m, turned=number * math.tau / HEADINGS)
                 collision = clearance.refusal(base_pose) if clearance is not None else None
                 if collision is not None:
-                    yield base_pose, PlaceReach(refusal=collision)
+                    yield Refusal(base_pose, collision)
                 else:
-                    yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
+                    yield _place(base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals))
 
 
 def _handle_goals(handle: geometry.Handle) -> list[Pose]:

@@ -463,10 +463,9 @@ def execute(motion: Performable, module: str) -> Awaitable[Any]:
         NoRobotChosen: no robot is chosen in this context.
         CapabilityAbsenceFailure: the modules lack the method.
     """
-    chosen = _chosen.get()
-    if not chosen:
+    robot = innermost_choice()
+    if robot is None:
         raise failures.NoRobotChosen(type(motion).__name__)
-    robot = chosen[-1]
     method = getattr(robot.modules, module, None)
     if method is None:
         name = type(motion).__name__
@@ -483,14 +482,14 @@ def innermost_choice() -> ChosenRobot | None:
 
 def chosen_limits() -> Limits:
     """Return the arm limits of the innermost choice; soft limits without a choice."""
-    chosen = _chosen.get()
-    return chosen[-1].limits if chosen else Limits.SOFT
+    choice = innermost_choice()
+    return choice.limits if choice is not None else Limits.SOFT
 
 
 def collisions_count() -> bool:
     """Return whether collisions count for the innermost choice; False without a choice."""
-    chosen = _chosen.get()
-    return bool(chosen) and chosen[-1].collisions
+    choice = innermost_choice()
+    return choice is not None and choice.collisions
 
 
 # === simulated robot ==========================================================================================

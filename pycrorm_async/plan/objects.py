@@ -110,12 +110,10 @@ class ObjectPart(ObjectDesignator):
         object_type: ObjectType = ObjectType.GENERIC_OBJECT,
         frozen_pose: Pose | None = None,
     ) -> None:
-        put = object.__setattr__
-        put(self, "name", name)
-        put(self, "object_type", object_type)
-        put(self, "world_object", None)
-        put(self, "frozen_pose", frozen_pose)
-        put(self, "part_of", designator_of(part_of))
+        whole = designator_of(part_of)
+        vars(self).update(
+            name=name, object_type=object_type, world_object=None, frozen_pose=frozen_pose, part_of=whole
+        )  # the attributes themselves are frozen
         _check(self, name=str, object_type=ObjectType)
 
     @property
@@ -167,14 +165,8 @@ class LocatedObject(ObjectDesignator):
         frozen_pose: Pose | None = None,
     ) -> None:
         moment = timestamp if timestamp is not None else utc_of(SYSTEM_CLOCK.wall_ns() // 1000)
-        put = object.__setattr__
-        put(self, "name", name)
-        put(self, "object_type", object_type)
-        put(self, "world_object", world_object)
-        put(self, "frozen_pose", frozen_pose)
-        put(self, "relative_pose", relative_pose)
-        put(self, "reference", designator_of(reference))
-        put(self, "timestamp", moment)
+        vars(self).update(name=name, object_type=object_type, world_object=world_object, frozen_pose=frozen_pose)
+        vars(self).update(relative_pose=relative_pose, reference=designator_of(reference), timestamp=moment)
         _check(self, name=str, object_type=ObjectType, relative_pose=Pose, timestamp=datetime)
         if moment.tzinfo is None:
             raise failures.ResolutionError(

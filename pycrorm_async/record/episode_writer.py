@@ -125,9 +125,9 @@ class EpisodeWriter:
 
     def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
-        tags = changed_tags(self._opening.labels.tags, added, removed)
+        tags = changed_tags(self._opening.tags, added, removed)
         self.events.put(event_types.EpisodeTagged(tuple(added), tuple(removed)))
-        self._opening = self._opening.with_tags(tags)
+        self._opening = self._opening._replace(tags=tags)
 
     def end_episode(self, failure: BaseException | None, world: str | None = None) -> None:
         """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.

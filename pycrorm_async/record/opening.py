@@ -29,16 +29,6 @@ _METADATA_BYTES_MAX: Final = 64 * 2**10
 """Bounds the metadata of an episode, which is one column: a page of settings, not data."""
 
 
-class Labels(NamedTuple):
-    """The tags of an episode, and its metadata as JSON values."""
-
-    tags: tuple[str, ...] = ()
-    metadata: Mapping[str, Any] = {}
-
-
-NO_LABELS: Final = Labels()
-
-
 def check_arguments(seed: object, **texts: object) -> None:
     """Check that an episode's arguments fit its columns. Raises `CallerError` naming the argument."""
     for name, text in texts.items():
@@ -49,10 +39,13 @@ def check_arguments(seed: object, **texts: object) -> None:
         raise CallerError(f"the seed of an episode must be an int of at most 64 bits, not {seed!r:.100}")
 
 
-def read_labels(tags: Iterable[str], metadata: object, settings: Settings, missing: MissingValues) -> Labels:
-    """Check tags and copy metadata. A value that cannot be recorded is null, and counted as missing.
+def read_labels(
+    tags: Iterable[str], metadata: object, settings: Settings, missing: MissingValues
+) -> tuple[tuple[str, ...], Mapping[str, Any]]:
+    """Return the tags of an episode, checked, and its metadata as JSON values.
 
-    Raises `CallerError` if the tags are not a list of short texts, and for metadata without text keys.
+    A value of the metadata that cannot be recorded is null, and counted as missing. Raises `CallerError` if the
+    tags are not a list of short texts, and for metadata without text keys.
     """
     checked = checked_tags(tags)
     if not isinstance(metadata, Mapping) or not all(isinstance(key, str) for key in metadata):
@@ -68,7 +61,7 @@ def read_labels(tags: Iterable[str], metadata: object, settings: Settings, missi
     if size > min(_METADATA_BYTES_MAX, settings.record_bytes_max // 4):
         missing.note("Episode", "metadata", f"it takes {size:,} bytes, {_METADATA_BYTES_MAX:,} are allowed")
         values = {}
-    return Labels(checked, values)
+    return checked, values
 
 
 def _refuse_blob(_content: bytes, _media_type: str) -> Any:
@@ -166,13 +159,10 @@ class EpisodeOpening(NamedTuple):
     simulated: bool = False
     thought_by: NodeReference | None = None
     provenance: Provenance | None = None
-    labels: Labels = NO_LABELS
+    tags: tuple[str, ...] = ()
+    metadata: Mapping[str, Any] = {}
     created_by: str | None = None
     is_past: bool = False
-
-    def with_tags(self, tags: tuple[str, ...]) -> EpisodeOpening:
-        """Return the arguments with these tags instead."""
-        return self._replace(labels=self.labels._replace(tags=tags))
 
 
 def episode_started(opening: EpisodeOpening) -> EpisodeStarted:
@@ -191,8 +181,8 @@ def episode_started(opening: EpisodeOpening) -> EpisodeStarted:
         world=clean(opening.world) if opening.world is not None else None,
         simulated=opening.simulated,
         thought_by=opening.thought_by,
-        tags=opening.labels.tags,
-        metadata=dict(opening.labels.metadata),
+        tags=opening.tags,
+        metadata=dict(opening.metadata),
         **provenance,
     )
 

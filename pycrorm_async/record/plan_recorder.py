@@ -325,18 +325,10 @@ class Recorder:
                 current_episode.set(record.outer_episode)
 
     def location_resolved(self, search: Search) -> None:
-        self._in_episode(
-            "LocationResolved",
-            lambda episode: episode.events.put(
-                location_resolved(search, episode.sequence_of(search.node)), clean(search.location)
-            ),
-        )
+        self._in_episode("LocationResolved", lambda episode: _put_location(episode, search))
 
-    def object_detected(self, *, node: TaskTreeNode | None, **percepts: Any) -> None:
-        self._in_episode(
-            "ObjectDetected",
-            lambda episode: episode.events.put(object_detected(episode, node=episode.sequence_of(node), **percepts)),
-        )
+    def object_detected(self, **percepts: Any) -> None:
+        self._in_episode("ObjectDetected", lambda episode: _put_percepts(episode, **percepts))
 
     def simulation_started(self, simulation: Simulation) -> None:
         if self._emitter.is_closed:
@@ -346,11 +338,16 @@ class Recorder:
             outer.node_reference(simulation.by) if outer is not None else None, outer
         )
         current_episode.set(None)  # so that no simulated event gets into the outer episode if this one cannot start
-        self._guarded("EpisodeStarted", self._start_simulation, simulation, record)
+        by = simulation.by.designator if simulation.by is not None else None
+        description = simulation.description
+        if description is None:
+            description = f"simulation in {by.__dtype__}" if by is not None else "simulation"
 
-    def _start_simulation(self, simulation: Simulation, record: _SimulationRecord) -> None:
-        record.episode = self.open_episode(description=_description_of(simulation))
-        current_episode.set(record.episode)
+        def start() -> None:
+            record.episode = self.open_episode(description=description)
+            current_episode.set(record.episode)
+
+        self._guarded("EpisodeStarted", start)
 
     def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
         record: _SimulationRecord | None = simulation.record
@@ -466,14 +463,6 @@ def _simulating_node(simulation: Simulation | None) -> event_types.NodeReference
     return record.node if isinstance(record, _SimulationRecord) else None
 
 
-def _description_of(simulation: Simulation) -> str:
-    if simulation.description is not None:
-        return simulation.description
-    if simulation.by is not None and simulation.by.designator is not None:
-        return f"simulation in {simulation.by.designator.__dtype__}"
-    return "simulation"
-
-
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -509,14 +498,13 @@ def with_tree(plan: Callable[_P, Coroutine[Any, Any, _T]]) -> Callable[_P, Corou
 
 # === episode events ===========================================================================================
 #
-# Build the events of resolved locations and of perception from values of the plan.
+# Write the events of resolved locations and of perception from values of the plan.
 
 
-def location_resolved(search: Search, node: int | None) -> event_types.LocationResolved:
-    """Build the event of a resolved location designator; `node` is the sequence of the node that resolved it."""
-    cells = search.cells
-    return event_types.LocationResolved(
-        location=clean(search.location),
+def _put_location(episode: Episode, search: Search) -> None:
+    location, cells = clean(search.location), search.cells
+    event = event_types.LocationResolved(
+        location=location,
         offered=tuple(
             event_types.CandidateValue(
                 brief_pose(each.pose),
@@ -528,24 +516,25 @@ def location_resolved(search: Search, node: int | None) -> event_types.LocationR
         ),
         taken=search.taken,
         considered=search.considered,
-        node=node,
+        node=episode.sequence_of(search.node),
         refused=tuple(event_types.RefusalValue(brief_pose(each.pose), clean(each.reason)) for each in search.refused),
         offered_beyond=search.offered_beyond,
         cells=event_types.CellsValue(cells.occupied, cells.hidden, cells.free) if cells is not None else None,
     )
+    episode.events.put(event, location)
 
 
-def object_detected(
-    references: Episode,
+def _put_percepts(
+    episode: Episode,
     *,
     source: Literal["camera", "world_state"],
     object_type: ObjectType | None,
     seen: Sequence[Seen],
-    node: int | None,
-) -> event_types.ObjectDetected:
-    """Build the event of a result of perception; `node` is the sequence of the node that requested it."""
-    values = tuple(_seen_value(each, references) for each in seen)
-    return event_types.ObjectDetected(source, object_type.name if object_type is not None else None, values, node)
+    node: TaskTreeNode | None,
+) -> None:
+    percepts = tuple(_seen_value(each, episode) for each in seen)
+    searched = object_type.name if object_type is not None else None
+    episode.events.put(event_types.ObjectDetected(source, searched, percepts, episode.sequence_of(node)))
 
 
 def _seen_value(seen: Seen, references: Episode) -> event_types.SeenValue:

@@ -4,7 +4,7 @@ import builtins
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Self, TypeAlias, cast, get_args
+from typing import Any, Self, cast, get_args
 from uuid import UUID
 
 from pycrorm_async.errors import CallerError
@@ -23,12 +23,6 @@ from pycrorm_async.record.values import clean, clean_repr
 
 _TYPES_MAX = 10_000
 """Bounds the declared types kept for reuse, which are all dropped then."""
-
-
-_Arguments: TypeAlias = tuple[
-    RecordedKind, str, tuple[tuple[str, declarations.FieldSpec], ...], tuple[str, ...], str | None, tuple[str, ...]
-]
-"""The arguments of `Recording.type`, in its order."""
 
 
 class Recording:
@@ -66,7 +60,8 @@ class Recording:
         self._provenance = provenance
         self._stored_episodes = stored_episodes
         self._calls = OrderedCalls()
-        self._types: dict[_Arguments, declarations.DeclaredType] = {}
+        self._types: dict[tuple[object, ...], declarations.DeclaredType] = {}
+        """The types declared so far, by the arguments of `type`."""
         self._lock = threading.RLock()
         for each in stored:
             known_types.note_stored(each)
@@ -98,33 +93,27 @@ class Recording:
             aliases: dtypes the type had before it was renamed.
         """
         try:
-            cached = kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases)
-            declared = self._types.get(cached)
+            further = {"bases": tuple(bases), "concept": concept, "aliases": tuple(aliases)}
+            arguments = kind, dtype, tuple(fields.items()), *further.values()
+            declared = self._types.get(arguments)
             if declared is None and not self.emitter.is_closed:  # first: a fork may leave the lock held
                 with self._lock:
                     if len(self._types) >= _TYPES_MAX:
                         self._types.clear()
-                    declared = self._types.get(cached) or self._declare(*cached)
-                    self._types[cached] = declared
+                    declared = self._types.get(arguments) or self._declare(kind, dtype, fields, **further)
+                    self._types[arguments] = declared
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             declared = None
             self.emitter.note_fault("DesignatorTypeDeclared", error)
         return declared or _undeclared(kind, dtype)
 
     def _declare(
-        self,
-        kind: RecordedKind,
-        dtype: str,
-        fields: tuple[tuple[str, declarations.FieldSpec], ...],
-        bases: tuple[str, ...],
-        concept: str | None,
-        aliases: tuple[str, ...],
+        self, kind: RecordedKind, dtype: str, fields: Mapping[str, declarations.FieldSpec], **further: Any
     ) -> declarations.DeclaredType:
-        if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
+        texts = kind, dtype, *further["bases"], *further["aliases"], further["concept"] or ""
+        if not all(isinstance(each, str) for each in texts):
             raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
-        declared = declarations.declare_named(
-            kind, dtype, dict(fields), self.known_types, bases=bases, concept=concept, aliases=aliases
-        )
+        declared = declarations.declare_named(kind, dtype, fields, self.known_types, **further)
         own, missing = declared.type, self.emitter.missing
         for name, reason in own.undeclared.items():
             missing.note(own.dtype, name, reason)
@@ -193,14 +182,9 @@ class Recording:
             raise CallerError(f"convert must be a function, not {convert!r:.100}")
         if not isinstance(unchecked[2], tuple) or not all(isinstance(each, builtins.type) for each in unchecked[2]):
             raise CallerError(f"failures must be a tuple of classes of exceptions, not {failures!r:.100}")
+        labels = openings.read_labels(tags, metadata, self.emitter.settings, self.emitter.missing)
         opening = self.opening(
-            text,
-            plan=plan,
-            seed=seed,
-            labels=openings.read_labels(tags, metadata, self.emitter.settings, self.emitter.missing),
-            world=world,
-            simulated=simulated,
-            thought_by=thought_by,
+            text, plan=plan, seed=seed, labels=labels, world=world, simulated=simulated, thought_by=thought_by
         )._replace(created_by=created_by, is_past=at is not None)
         episode = RecordedEpisode(
             self.emitter, self.episodes, self._calls, opening, convert, failures, id=identity, at=at
@@ -217,7 +201,7 @@ class Recording:
         *,
         plan: str | None = None,
         seed: int | None = None,
-        labels: openings.Labels = openings.NO_LABELS,
+        labels: tuple[tuple[str, ...], Mapping[str, Any]] = ((), {}),
         world: str | None = None,
         simulated: bool = False,
         thought_by: NodeReference | None = None,
@@ -227,7 +211,7 @@ class Recording:
         if thought_by is not None and not _is_whole(thought_by):
             raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
         return openings.EpisodeOpening(
-            description, self._software, plan, seed, world, simulated, thought_by, self._provenance, labels
+            description, self._software, plan, seed, world, simulated, thought_by, self._provenance, *labels
         )
 
     def note_fault(self, where: str, error: BaseException) -> None:

@@ -34,7 +34,7 @@ from pycrorm_async.plan import (
     SemanticCostmapLocation,
     simulated_robot,
 )
-from pycrorm_async.plan.execution import Candidate, Cells
+from pycrorm_async.plan.execution import Candidate, Cells, Refusal
 from pycrorm_async.plan.failures import (
     LookingHighLevelFailure,
     NavigationGoalInCollision,
@@ -489,9 +489,10 @@ def test_places_to_open_a_drawer_are_clear_of_the_kitchen(scene: Scene) -> None:
         assert AccessingLocation(handle, scene.robot).resolve().reachable_arms
         found = itertools.islice(opening_poses(handle, scene.robot, None), 1_201)
         searched = [each for each in found if not isinstance(each, Cells)]
-    refused = [pose for pose, reach in searched if (reach.refusal or "").startswith("base in collision with kitchen")]
+    reason = "base in collision with kitchen"
+    refused = [each.pose for each in searched if isinstance(each, Refusal) and each.reason.startswith(reason)]
     assert 0 < len(refused) < len(searched) / 4
-    for pose, _ in searched:
+    for pose in (each.pose for each in searched):
         assert pose in refused or not base_collisions(scene.robot, pose)
     assert any(base_collisions(scene.robot, pose) for pose in refused)
 
