@@ -93,7 +93,8 @@ class ObjectRows(Generic[K]):
         pose, reference, written = state.pose, state.object, state
         if pose is not None:
             row, placed = self._placed.get(reference.object, (0, pose)) if reference is not None else (0, pose)
-            is_in_row = reference is not None and reference.row == row and _are_one_pose(placed, pose)
+            is_current = reference is not None and reference.row == row
+            is_in_row = is_current and placed.time_ns == pose.time_ns and _are_at_one_place(placed, pose)
             written_pose = None if is_in_row else event_types.BriefPose.of(pose)
             written = replace(state, pose=written_pose, object_type=intern(state.object_type))
         try:
@@ -237,7 +238,3 @@ class RecordedObjects(ObjectRows[Hashable]):
 
 def _are_at_one_place(pose: PoseLike | event_types.PoseValue, other: PoseLike | event_types.PoseValue) -> bool:
     return pose.position == other.position and pose.orientation == other.orientation and pose.frame == other.frame
-
-
-def _are_one_pose(pose: event_types.PoseValue, other: event_types.PoseValue) -> bool:
-    return pose.time_ns == other.time_ns and _are_at_one_place(pose, other)

@@ -208,11 +208,12 @@ class Recorder:
                 f"episode {open_episode} is open in this task already: end it first, or open the other in its own task"
             )
         simulation, world = current_simulation.get(), current_world.get()
+        record = simulation.record if simulation is not None else None
         opening = self._recording.opening(
             description,
             world=world.description if world else None,
             simulated=simulation is not None,
-            thought_by=_simulating_node(simulation),
+            thought_by=record.node if isinstance(record, _SimulationRecord) else None,
             **arguments,
         )
         episode = Episode(self._recording, opening)
@@ -278,7 +279,8 @@ class Recorder:
             missing: dict[str, str] = {}
             parameters = read_parameters(designator, declared.fields, episode, missing)
             robot = episode.robot_state() if episode.world is not None else None
-            poses = _poses_around(node, episode)
+            around: NodeRecord | None = node.parent.record if node.parent is not None else None
+            poses = around.poses if around is not None and around.episode is episode else ()
             fields = self._pose_fields.get(kind)
             if fields is None:
                 fields = self._pose_fields[kind] = values.pose_fields(declared.declaration.fields)
@@ -432,11 +434,6 @@ class Recorder:
             self._emitter.note_fault(event_type, error)
 
 
-def _poses_around(node: TaskTreeNode, episode: Episode) -> values.KnownPoses:
-    record: NodeRecord | None = node.parent.record if node.parent is not None else None
-    return record.poses if record is not None and record.episode is episode else ()
-
-
 def observing() -> Recorder | None:
     """Return the recorder of the memory that records this context; None if there is no open memory."""
     observer = plan_observer.get()
@@ -456,11 +453,6 @@ class _SimulationRecord:
     node: event_types.NodeReference | None
     outer_episode: Episode | None
     episode: Episode | None = None
-
-
-def _simulating_node(simulation: Simulation | None) -> event_types.NodeReference | None:
-    record = simulation.record if simulation is not None else None
-    return record.node if isinstance(record, _SimulationRecord) else None
 
 
 _P = ParamSpec("_P")

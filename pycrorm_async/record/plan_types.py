@@ -258,8 +258,10 @@ def _own_fields(
 def _without_column(parameter: Parameter) -> str:
     if isinstance(parameter.hint, Unresolved):
         return parameter.hint.reason
+    hint = parameter.hint
+    text = hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
     return (
-        f"has the type {hint_text(parameter.hint)}, which has no column: use int, float, str, bool, an Enum, an aware"
+        f"has the type {text}, which has no column: use int, float, str, bool, an Enum, an aware"
         " datetime, a Pose, an object designator, a dataclass of these, or a list or dict of these"
     )
 
@@ -361,7 +363,3 @@ def _resolved(annotation: Any, globals_: Mapping[str, Any], locals_: Mapping[str
         return typing.get_type_hints(holder, dict(globals_), dict(locals_), include_extras=False)["it"]
     except Exception as error:  # noqa: BLE001  an annotation is any expression
         return Unresolved(f"has a type that cannot be resolved: {error}")
-
-
-def hint_text(hint: Any) -> str:
-    return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)

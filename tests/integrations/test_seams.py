@@ -136,10 +136,3 @@ def test_the_version_of_a_distribution_is_read_without_importing_it() -> None:
     expected = rf"Engine \(no-such-engine 1\.4\.2 or 2\.\*\) is not installed: {INSTALL}"
     with pytest.raises(MissingExtra, match=expected):
         ENGINE.installed_version("no-such-engine")
-
-
-def test_without_versions_any_version_is_accepted() -> None:
-    engine = ForeignPackage("Engine", extra="engine")
-    engine.check_version("0.0.1")
-    with pytest.raises(MissingExtra, match=rf"Engine \(no-such-engine\) is not installed: {INSTALL}"):
-        engine.installed_version("no-such-engine")

@@ -13,7 +13,6 @@ from pycrorm_async.plan import (
     IKError,
     MoveAndPickUpPerformable,
     MoveTCPMotion,
-    MoveTorsoActionPerformable,
     NavigateActionPerformable,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
@@ -25,7 +24,6 @@ from pycrorm_async.plan.failures import (
     IllPosedGoalFailure,
     ObjectLost,
     PerceptionObjectNotInWorld,
-    TorsoGoalUnreachable,
 )
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.plan.task import CollectedTree
@@ -126,13 +124,6 @@ async def test_only_what_this_arm_holds_can_be_placed(scene: Scene) -> None:
         await PlaceActionPerformable(scene.milk, Arms.RIGHT, Pose([1.3, 1, 0.9])).perform()
 
 
-async def test_a_place_out_of_reach_keeps_the_object_in_the_hand(scene: Scene) -> None:
-    scene.robot.attach(scene.milk, LEFT_TOOL)
-    with pytest.raises(IKError):
-        await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([5, 5, 1])).perform()
-    assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
-
-
 async def test_facing_turns_base_and_head_without_moving_the_base(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.5, 0.5, 0], yaw_quaternion(3.0))).perform()
     with collected_tree() as tree:
@@ -174,15 +165,6 @@ async def test_parked_arms_are_at_their_park_positions(scene: Scene, arm: Arms, 
     if arm is not Arms.LEFT:
         assert scene.robot.joint_position("r_shoulder_pan_joint") == -1.712
     assert shape(tree) == ["ParkArmsActionPerformable", "  MoveArmJointsMotion"]
-
-
-async def test_the_torso_moves_up_within_its_limits(scene: Scene) -> None:
-    with collected_tree() as tree:
-        await MoveTorsoActionPerformable(0.3).perform()
-    assert scene.robot.joint_position("torso_lift_joint") == 0.3
-    assert shape(tree) == ["MoveTorsoActionPerformable", "  MoveJointsMotion"]
-    with pytest.raises(TorsoGoalUnreachable):
-        await MoveTorsoActionPerformable(1.0).perform()
 
 
 # === default policy ===========================================================================================

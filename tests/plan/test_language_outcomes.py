@@ -162,12 +162,6 @@ async def test_a_failed_resolution_is_a_failure_of_the_operand(scene: Scene) -> 
     assert outcome.succeeded == (1,)
 
 
-async def test_the_text_of_an_expression_has_the_operations_that_it_performs() -> None:
-    plan = Step("a") + NavigateAction([]) + Code(print) * 2
-    assert repr(plan) == "Sequential(StepAction, NavigateAction, Repeat)"
-    assert repr(Code(print)) == "Code(print)"
-
-
 async def test_the_text_of_an_outcome_has_only_what_is_present() -> None:
     assert repr(await (Step("a") - Step("b")).perform()) == "Outcome(results=('a', None), succeeded=(0,))"
     assert repr(Outcome((None,), interrupted=False)) == "Outcome(results=(None,), interrupted=False)"

@@ -104,13 +104,6 @@ async def test_both_arms_move_in_one_motion(scene: Scene, watching: Watching) ->
     assert watching.seen == ["joints 2"]
 
 
-async def test_joints_move_in_one_motion(scene: Scene, watching: Watching) -> None:
-    await MoveJointsMotion(["torso_lift_joint", "head_pan_joint"], [0.2, 1]).perform()
-    assert scene.robot.joint_position("torso_lift_joint") == 0.2
-    assert scene.robot.joint_position("head_pan_joint") == 1.0
-    assert watching.seen == ["joints 2"]
-
-
 async def test_joints_beyond_their_limits_are_plan_failures_and_move_nothing(scene: Scene, watching: Watching) -> None:
     with pytest.raises(TorsoGoalUnreachable, match="torso_lift_joint") as torso:
         await MoveJointsMotion(["torso_lift_joint"], [2.0]).perform()

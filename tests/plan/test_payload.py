@@ -44,7 +44,6 @@ from pycrorm_async.world import (
     robot_description,
 )
 from pycrorm_async.world.models import built_in_model
-from pycrorm_async.world.pose import ObjectRefused
 from pycrorm_async.world.world_copy import copied, counterpart
 
 PLACE = Pose([0.65, 0, 0.9])
@@ -83,13 +82,6 @@ def test_a_mass_is_given_or_described_or_unknown(world: BulletWorld) -> None:
     assert Object("milk", ObjectType.MILK).mass_kg == 1.06
     assert Object("pr2", ObjectType.ROBOT).mass_kg is None
     assert Object("kitchen", ObjectType.ENVIRONMENT).mass_kg is None
-
-
-@pytest.mark.parametrize("mass", [0, -1.0, math.nan, math.inf, "heavy"])
-def test_a_given_mass_is_a_number_above_0(world: BulletWorld, mass: float) -> None:
-    with pytest.raises(ObjectRefused, match="the mass of object 'a' must be a number of kg > 0"):
-        Object("a", ObjectType.MILK, mass_kg=mass)
-    assert world.objects == ()
 
 
 @pytest.mark.parametrize(
@@ -226,13 +218,6 @@ async def test_a_required_arm_is_not_replaced_and_no_combination_is_lost(lopside
         (milk, Arms.LEFT, Grasp.TOP),
     ]
     assert {each.arm for each in MoveAndPickUp(milk, arms=[Arms.LEFT]).plain()} == {Arms.LEFT}
-
-
-async def test_what_an_arm_chosen_so_lifts_is_transported(lopsided: Object) -> None:
-    milk = lopsided.world.object("milk")
-    goal = Pose([1.3, 0.0, 0.9])
-    await TransportAction(milk, [Arms.LEFT, Arms.RIGHT], [goal]).resolve().perform()
-    assert milk.pose.distance(goal) < 1e-5
 
 
 def test_a_lacking_arm_or_an_absent_robot_or_object_leaves_the_first_alternative(courier: Object) -> None:
