@@ -39,76 +39,54 @@ from pycrorm_async.events.types import (
 
 START = EpisodeStarted("d", "me", "here", "0", "3")
 POSE = PoseValue((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 0)
-DONE = EpisodeEnded("SUCCEEDED")
+ROOT, ACTION, DONE = NodeStarted("root"), NodeStarted("action", 2), EpisodeEnded("SUCCEEDED")
+MOVED = ObjectMoved(3, "milk", "MILK", POSE, 4)
 
 
-def findings(*events: tuple[int, Happening]) -> list[Finding]:
-    check = OrderCheck()
-    return [violation for sequence, event in events for violation in check.read(sequence, event)]
+def findings(*events: Happening | int) -> list[Finding]:
+    """Return what the check finds in events with the sequences 1, 2, 3 …; a number is that of the next event."""
+    check, violations, sequence = OrderCheck(), list[Finding](), 0
+    for each in events:
+        if isinstance(each, int):
+            sequence = each - 1
+        else:
+            sequence += 1
+            violations += check.read(sequence, each)
+    return violations
 
 
 def test_an_ordinary_episode_has_no_findings() -> None:
-    assert (
-        findings(
-            (1, START),
-            (2, NodeStarted("root")),
-            (3, ObjectAdded("milk", "MILK", POSE)),
-            (4, NodeStarted("action", 2)),
-            (5, LocationResolved("L", node=4)),
-            (6, ObjectMoved(3, "milk", "MILK", POSE, 4)),
-            (7, NodeEnded(4, "SUCCEEDED")),
-            (8, NodeEnded(2, "SUCCEEDED")),
-            (9, DONE),
-        )
-        == []
-    )
+    node = ACTION, LocationResolved("L", node=4), MOVED, NodeEnded(4), NodeEnded(2)
+    assert findings(START, ROOT, ObjectAdded("milk", "MILK", POSE), *node, DONE) == []
+    assert findings(START, ROOT, EpisodeEnded("LOST")) == []  # with an open node
 
 
 @pytest.mark.parametrize(
     ("events", "finding"),
     [
-        (((1, START), (3, DONE)), (3, "event 2 is missing")),
-        (((1, START), (5, DONE)), (5, "events 2 to 4 are missing")),
-        (((1, START), (1, DONE)), (1, "event 1 follows event 1")),
-        (((1, DONE),), (1, "the episode has not started")),
-        (((1, START), (2, START)), (2, "the episode starts a second time")),
-        (((1, START), (2, DONE), (3, DONE)), (3, "the episode has ended already")),
-        (((1, START), (2, NodeStarted("action", 7))), (2, "its parent 7 never started")),
-        (
-            ((1, START), (2, NodeStarted("root")), (3, NodeStarted("root"))),
-            (3, "a second node without a parent"),
-        ),
-        (((1, START), (2, NodeEnded(9, "SUCCEEDED"))), (2, "node 9 ends and never started")),
-        (((1, START), (2, ObjectMoved(9, "m", "MILK", POSE))), (2, "object 9 was never added")),
-        (((1, START), (2, LocationResolved("L", node=9))), (2, "node 9 never started")),
+        ((START, 3, DONE), (3, "event 2 is missing")),
+        ((START, 5, DONE), (5, "events 2 to 4 are missing")),
+        ((START, 1, DONE), (1, "event 1 follows event 1")),
+        ((DONE,), (1, "the episode has not started")),
+        ((START, START), (2, "the episode starts a second time")),
+        ((START, DONE, DONE), (3, "the episode has ended already")),
+        ((START, NodeStarted("action", 7)), (2, "its parent 7 never started")),
+        ((START, ROOT, ROOT), (3, "a second node without a parent")),
+        ((START, NodeEnded(9)), (2, "node 9 ends and never started")),
+        ((START, ROOT, NodeEnded(2), NodeEnded(2)), (4, "node 2 ends a second time")),
+        ((START, MOVED), (2, "object 3 was never added")),
+        ((START, LocationResolved("L", node=9)), (2, "node 9 never started")),
     ],
 )
-def test_a_structural_break_is_damage(events: tuple[tuple[int, Happening], ...], finding: tuple[int, str]) -> None:
+def test_a_structural_break_is_damage(events: tuple[Happening | int, ...], finding: tuple[int, str]) -> None:
     assert findings(*events) == [Finding("damage", *finding)]
 
 
-def test_ending_twice_is_damage() -> None:
-    ended = NodeEnded(2, "SUCCEEDED")
-    assert findings((1, START), (2, NodeStarted("root")), (3, ended), (4, ended)) == [
-        Finding("damage", 4, "node 2 ends a second time")
-    ]
-
-
-def test_a_child_that_ends_after_its_cancelled_parent_is_a_remark() -> None:
-    assert findings(
-        (1, START),
-        (2, NodeStarted("root")),
-        (3, NodeStarted("action", 2)),
-        (4, NodeStarted("motion", 3)),
-        (5, NodeEnded(3, "CANCELLED")),
-        (6, NodeEnded(4, "CANCELLED")),
-    ) == [Finding("remark", 6, "node 4 ends after its parent 3")]
-
-
-def test_nodes_open_at_the_end_are_a_remark_unless_the_episode_was_lost() -> None:
-    open_node = ((1, START), (2, NodeStarted("root")))
-    assert findings(*open_node, (3, DONE)) == [Finding("remark", 3, "1 nodes are open at the end")]
-    assert findings(*open_node, (3, EpisodeEnded("LOST"))) == []
+def test_a_child_that_ends_after_its_cancelled_parent_and_a_node_open_at_the_end_are_remarks() -> None:
+    ends = NodeEnded(3, "CANCELLED"), NodeEnded(4, "CANCELLED")
+    late = Finding("remark", 6, "node 4 ends after its parent 3")
+    assert findings(START, ROOT, ACTION, NodeStarted("motion", 3), *ends) == [late]
+    assert findings(START, ROOT, DONE) == [Finding("remark", 3, "1 nodes are open at the end")]
 
 
 # === fields ===================================================================================================

@@ -15,10 +15,8 @@ from langchain_core.messages import AIMessage
 from langchain_core.retrievers import BaseRetriever
 from langchain_core.runnables import RunnableLambda, RunnableParallel
 from langchain_core.tools import ToolException, tool
-from langgraph.checkpoint.memory import InMemorySaver
 from langgraph.graph import END, START, MessagesState, StateGraph
 from langgraph.prebuilt import ToolNode
-from langgraph.types import interrupt
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.integrations.callbacks import RememberedRuns
@@ -121,7 +119,8 @@ async def test_an_agent_is_a_tree_of_chains_models_and_tools(tmp_path: Path, run
     assert ask(tmp_path / "executive.db", named) == [("LangGraph",), ("model",), ("tools",), ("model",)]
 
 
-def test_prompts_answers_and_token_counts_are_recorded(tmp_path: Path) -> None:
+@pytest.mark.every_python
+def test_prompts_answers_token_counts_and_the_inputs_of_tools_are_recorded(tmp_path: Path) -> None:
     remembered(tmp_path, _invoke)
     rows = ask(
         tmp_path / "memory.db",
@@ -138,11 +137,6 @@ def test_prompts_answers_and_token_counts_are_recorded(tmp_path: Path) -> None:
     }
     inputs = ask(tmp_path / "memory.db", "SELECT inputs FROM chain WHERE inputs IS NOT NULL")
     assert [json.loads(text) for (text,) in inputs] == [{"messages": [["user", "bring milk"]]}]
-
-
-@pytest.mark.every_python
-def test_the_input_of_a_tool_is_its_parameters(tmp_path: Path) -> None:
-    remembered(tmp_path, _invoke)
     file = tmp_path / "memory.db"
     assert ask(file, "SELECT object_name, force_n FROM pick_up") == [("milk", 5.0)]
     assert ask(file, "SELECT place FROM drive") == [("[1, 2.5]",)]
@@ -193,19 +187,6 @@ def test_a_tool_that_answers_with_an_error_has_failed(tmp_path: Path) -> None:
     remembered(tmp_path, lambda runs: grasp.invoke(slippery, {"callbacks": [runs]}))
     (row,) = ask(tmp_path / "memory.db", "SELECT status, result FROM grasp JOIN task_tree_node USING (id)")
     assert (row[0], json.loads(row[1])["content"]) == ("FAILED", "soap is slippery")
-
-
-def test_a_graph_that_waits_for_a_human_is_interrupted(tmp_path: Path) -> None:
-    graph = StateGraph(MessagesState)
-    graph.add_node("ask", lambda _state: {"messages": [("ai", str(interrupt("may I?")))]})
-    graph.add_edge(START, "ask")
-    compiled = graph.compile(checkpointer=InMemorySaver())
-
-    def run(runs: RememberedRuns) -> None:
-        compiled.invoke(request("open"), {"callbacks": [runs], "configurable": {"thread_id": "1"}})
-
-    remembered(tmp_path, run)
-    assert [each[:3] for each in nodes(tmp_path)] == [("Chain", None, "SUCCEEDED"), ("Chain", "Chain", "INTERRUPTED")]
 
 
 class Shelf(BaseRetriever):

@@ -45,7 +45,7 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
 )
 from pycrorm_async.plan.failures import IllPosedGoalFailure, ObjectNotFound, PerformNotAsync, ResolutionError
-from pycrorm_async.plan.language import ActionAbstract, BaseMotion
+from pycrorm_async.plan.language import ActionAbstract, ActionDescription, BaseMotion
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType
@@ -255,28 +255,40 @@ def test_a_motion_whose_annotations_cannot_be_read_is_not_checked() -> None:
 HERE, THERE = Pose([0, 0, 0]), Pose([1, 0, 0])
 
 
-def test_resolving_takes_the_first_of_each() -> None:
-    assert NavigateAction([HERE, THERE]).resolve() == NavigateActionPerformable(HERE)
-    assert NavigateAction(target_locations=iter([THERE])).resolve() == NavigateActionPerformable(THERE)
-    assert MoveTorsoAction(positions=[0.3, 0.2]).resolve() == MoveTorsoActionPerformable(0.3)
-    assert ParkArmsAction(arms=[Arms.BOTH]).resolve() == ParkArmsActionPerformable(Arms.BOTH)
-    assert LookAtAction(targets=[THERE]).resolve() == LookAtActionPerformable(THERE)
-    assert SetGripperAction(grippers=[Arms.LEFT], motions=[GripperState.OPEN]).resolve() == SetGripperActionPerformable(
-        Arms.LEFT, GripperState.OPEN
-    )
+MILK, BOTH = ObjectDesignatorDescription(names=["milk"]), [Arms.RIGHT, Arms.LEFT]
 
 
-def test_one_value_needs_no_list(scene: Scene) -> None:
-    assert ParkArmsAction(Arms.LEFT).resolve() == ParkArmsActionPerformable(Arms.LEFT)
-    assert MoveTorsoAction(0.2).resolve() == MoveTorsoActionPerformable(0.2)
-    assert NavigateAction(THERE).resolve() == NavigateActionPerformable(THERE)
-    opening = SetGripperAction([Arms.LEFT, Arms.RIGHT], GripperState.OPEN)
-    assert [each.gripper for each in opening] == [Arms.LEFT, Arms.RIGHT]
-    assert TransportAction(scene.milk, Arms.LEFT, THERE).resolve() == TransportActionPerformable(
-        scene.milk, Arms.LEFT, THERE
-    )
-    two = PickUpAction((each for each in (scene.milk, scene.cereal)), Arms.LEFT, Grasp.TOP)
-    assert [each.object_designator for each in two] == [scene.milk, scene.cereal]
+def handle(scene: Scene, name: str = "fridge_door") -> ObjectPart:
+    return ObjectPart(f"{name}_handle", scene.kitchen)
+
+
+RESOLVED: list[Callable[[Scene], tuple[ActionDescription[Any], ActionAbstract]]] = [
+    lambda _: (NavigateAction([HERE, THERE]), NavigateActionPerformable(HERE)),
+    lambda _: (NavigateAction(target_locations=iter([THERE])), NavigateActionPerformable(THERE)),
+    lambda _: (NavigateAction(THERE), NavigateActionPerformable(THERE)),
+    lambda _: (MoveTorsoAction(positions=[0.3, 0.2]), MoveTorsoActionPerformable(0.3)),
+    lambda _: (MoveTorsoAction(0.2), MoveTorsoActionPerformable(0.2)),
+    lambda _: (ParkArmsAction(arms=[Arms.BOTH]), ParkArmsActionPerformable(Arms.BOTH)),
+    lambda _: (ParkArmsAction(Arms.LEFT), ParkArmsActionPerformable(Arms.LEFT)),
+    lambda _: (LookAtAction(targets=[THERE]), LookAtActionPerformable(THERE)),
+    lambda s: (GripAction(BOTH, MILK, [20.0, 5]), GripActionPerformable(Arms.RIGHT, designator_of(s.milk), 20.0)),
+    lambda s: (ReleaseAction(BOTH, s.milk), ReleaseActionPerformable(Arms.RIGHT, s.milk)),
+    lambda s: (GraspingAction(BOTH, [handle(s), s.milk]), GraspingActionPerformable(Arms.RIGHT, handle(s))),
+    lambda s: (OpenAction([handle(s)], arms=BOTH), OpenActionPerformable(handle(s), Arms.RIGHT)),
+    lambda s: (CloseAction(handle(s), BOTH), CloseActionPerformable(handle(s), Arms.RIGHT)),
+    lambda s: (DetectAction(MILK), DetectActionPerformable(designator_of(s.milk))),
+    lambda s: (
+        TransportAction(s.milk, Arms.LEFT, target_locations=[THERE, HERE]),
+        TransportActionPerformable(s.milk, Arms.LEFT, THERE),
+    ),
+]
+"""Descriptions, of one value or several, and the first alternative of each."""
+
+
+def test_resolving_takes_the_first_of_each(scene: Scene) -> None:
+    for make in RESOLVED:
+        description, first = make(scene)
+        assert description.resolve() == first
 
 
 def test_a_value_that_is_no_alternative_is_refused_whole_and_by_name(scene: Scene) -> None:
@@ -288,37 +300,15 @@ def test_a_value_that_is_no_alternative_is_refused_whole_and_by_name(scene: Scen
         PickUpAction("milk", [Arms.LEFT], [Grasp.FRONT]).resolve()  # type: ignore[arg-type]
 
 
-def test_grasping_and_perceiving_actions_accept_objects_and_handles(scene: Scene) -> None:
-    milk = ObjectDesignatorDescription(names=["milk"])
-    meant = designator_of(scene.milk)
-    handles = [ObjectPart(f"{name}_handle", scene.kitchen) for name in ("fridge_door", "sink_area_drawer")]
-    both = [Arms.RIGHT, Arms.LEFT]
-    assert GripAction(both, milk, [20.0, 5]).resolve() == GripActionPerformable(Arms.RIGHT, meant, 20.0)
-    assert ReleaseAction(both, object_designator_description=scene.milk).resolve() == ReleaseActionPerformable(
-        Arms.RIGHT, scene.milk
-    )
-    assert GraspingAction(arms=both, object_description=handles).resolve() == GraspingActionPerformable(
-        Arms.RIGHT, handles[0]
-    )
-    assert OpenAction(handles, arms=both).resolve() == OpenActionPerformable(handles[0], Arms.RIGHT)
-    assert CloseAction(handles[1], both).resolve() == CloseActionPerformable(handles[1], Arms.RIGHT)
-    assert DetectAction(object_designator_description=milk).resolve() == DetectActionPerformable(meant)
-    assert TransportAction(milk, both, target_locations=[THERE, HERE]).resolve() == TransportActionPerformable(
-        meant, Arms.RIGHT, THERE
-    )
-    assert list(OpenAction(handles, both)) == [OpenActionPerformable(handle, arm) for handle in handles for arm in both]
-
-
-def test_iterating_yields_every_combination_the_last_property_fastest() -> None:
-    both = SetGripperAction([Arms.LEFT, Arms.RIGHT], [GripperState.OPEN, GripperState.CLOSE])
-    expected = [
-        SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN),
-        SetGripperActionPerformable(Arms.LEFT, GripperState.CLOSE),
-        SetGripperActionPerformable(Arms.RIGHT, GripperState.OPEN),
-        SetGripperActionPerformable(Arms.RIGHT, GripperState.CLOSE),
-    ]
-    assert list(both) == expected
-    assert list(both) == expected
+def test_iterating_yields_every_combination_the_last_property_fastest(scene: Scene) -> None:
+    arms, states = [Arms.LEFT, Arms.RIGHT], [GripperState.OPEN, GripperState.CLOSE]
+    both = SetGripperAction(arms, states)
+    for _ in range(2):
+        assert list(both) == [SetGripperActionPerformable(arm, state) for arm in arms for state in states]
+    handles = [handle(scene), handle(scene, "sink_area_drawer")]
+    assert list(OpenAction(handles, arms)) == [OpenActionPerformable(each, arm) for each in handles for arm in arms]
+    two = PickUpAction((each for each in (scene.milk, scene.cereal)), Arms.LEFT, Grasp.TOP)
+    assert [each.object_designator for each in two] == [scene.milk, scene.cereal]
 
 
 def test_objects_may_be_described_given_or_several(scene: Scene) -> None:
@@ -361,8 +351,6 @@ def test_no_alternative_is_a_failure_that_names_the_property() -> None:
 # === not resolved =============================================================================================
 #
 # A description in place of a resolved designator: one line states that `.resolve()` is missing.
-
-MILK = ObjectDesignatorDescription(names=["milk"])
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,7 @@ async def test_placing_grasping_and_opening_name_theirs(scene: Scene) -> None:
     ):
         with pytest.raises(IKError, match=f", reaching for {name}$"):
             await action.perform()
+    assert scene.milk.attached_to is scene.robot  # a place out of reach keeps it in the hand
 
 
 async def test_a_motion_for_no_object_names_none(scene: Scene) -> None:

@@ -23,13 +23,10 @@ from pycrorm_async.plan import (
     Parallel,
     ParkArmsAction,
     PickUpAction,
-    PlanFailure,
     Repeat,
     Sequential,
-    TaskStatus,
     TryAll,
     TryInOrder,
-    collected_tree,
 )
 from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.plan.language import Composable, Expression
@@ -113,37 +110,6 @@ async def test_code_may_be_a_function_or_a_coroutine_function() -> None:
 
     outcome = await (Code(add, a=2, b=40) + Code(slowly, text="done")).perform()
     assert outcome.results == (42, "done")
-
-
-@pytest.mark.parametrize(
-    ("combine", "succeeds", "moves"),
-    [
-        (lambda failing, then: failing + then, False, False),
-        (lambda failing, then: failing - then, True, True),
-        (lambda failing, then: failing | then, False, True),
-        (lambda failing, then: failing ^ then, True, True),
-    ],
-    ids=["sequential", "in order", "parallel", "try all"],
-)
-async def test_a_failure_ends_a_sequence_and_fails_branches_and_alternatives_go_on(
-    scene: Scene, combine: Callable[[Composable, Composable], Expression], succeeds: bool, moves: bool
-) -> None:
-    failure = PlanFailure("no")
-
-    def fail() -> None:
-        raise failure
-
-    with collected_tree() as tree:
-        if succeeds:
-            outcome = await combine(Code(fail), A).perform()
-            assert (outcome.failures, outcome.succeeded) == ((failure,), (1,))
-        else:
-            with pytest.raises(PlanFailure) as caught:
-                await combine(Code(fail), A).perform()
-            assert caught.value is failure
-    status = TaskStatus.SUCCEEDED if succeeds else TaskStatus.FAILED
-    assert (tree.roots[0].status, tree.roots[0].failure) == (status, None if succeeds else failure)
-    assert scene.robot.pose.position == pytest.approx((1, 1, 0) if moves else (0, 0, 0))
 
 
 async def test_descriptions_are_resolved_when_they_are_performed(scene: Scene) -> None:

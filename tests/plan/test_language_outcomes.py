@@ -94,13 +94,6 @@ async def test_an_exception_group_of_the_plan_counts_as_a_failure() -> None:
     }
 
 
-async def test_one_success_is_enough_for_concurrent_alternatives_and_all_run_to_their_end() -> None:
-    log: list[str] = []
-    outcome = await (failing("a") ^ Step("b", log) ^ Step("c", log, turns=5)).perform()
-    assert (outcome.results, outcome.succeeded) == ((None, "b", "c"), (1, 2))
-    assert log == ["b", "b.", "c", "c."]
-
-
 # --- operands ---------------------------------------------------------------------------------------------------------
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 import pytest
@@ -345,50 +345,42 @@ async def _assert_ends(dice: random.Random) -> None:
 #
 # The parts of the robot that each built-in designator requires.
 
-THERE = Pose([1, 0, 0])
-LEFT_PART, RIGHT_PART, BASE_PART, TORSO, HEAD_PART = (
-    Resource.LEFT_ARM,
-    Resource.RIGHT_ARM,
-    Resource.BASE,
-    Resource.TORSO,
-    Resource.HEAD,
-)
+THERE, TORSO = Pose([1, 0, 0]), Resource.TORSO
+STANDING = {BASE, TORSO}
+REQUIRED: list[tuple[Callable[[Scene], Designator], set[Resource]]] = [
+    (lambda _: MoveMotion(THERE), {BASE}),
+    (lambda _: NavigateActionPerformable(THERE), {BASE}),
+    (lambda _: LookingMotion(THERE), {HEAD}),
+    (lambda _: MoveGripperMotion(GripperState.OPEN, Arms.RIGHT), {RIGHT}),
+    (lambda _: SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN), {LEFT}),
+    (lambda _: ParkArmsActionPerformable(Arms.BOTH), {LEFT, RIGHT}),
+    (lambda _: MoveTorsoActionPerformable(0.2), {TORSO}),
+    (lambda _: MoveArmJointsMotion({"l_elbow_flex_joint": -1.0}), {LEFT}),
+    (lambda _: MoveArmJointsMotion(None, {"r_elbow_flex_joint": -1.0}), {RIGHT}),
+    (lambda _: FaceAtPerformable(THERE), {BASE, HEAD}),
+    (lambda s: DetectActionPerformable(s.milk), {HEAD}),
+    (lambda _: MoveTCPMotion(THERE, Arms.LEFT), {LEFT} | STANDING),
+    (lambda s: PickUpActionPerformable(s.milk, Arms.RIGHT, Grasp.FRONT), {RIGHT} | STANDING),
+    (lambda s: PlaceActionPerformable(s.milk, Arms.RIGHT, THERE), {RIGHT} | STANDING),
+    (lambda s: GripActionPerformable(Arms.LEFT, s.milk, 1.0), {LEFT} | STANDING),
+    (lambda s: OpenActionPerformable(ObjectPart("fridge_door_handle", s.kitchen), Arms.LEFT), {LEFT} | STANDING),
+    (lambda s: MoveAndPickUpPerformable(THERE, s.milk, Arms.LEFT, Grasp.TOP), {LEFT, HEAD} | STANDING),
+    (lambda s: TransportActionPerformable(s.milk, Arms.LEFT, THERE), {LEFT, RIGHT} | STANDING),
+]
 
 
 def needs(designator: Designator) -> set[Resource]:
     return set(designator.resources())
 
 
-def test_a_motion_of_one_part_requires_that_part() -> None:
-    assert needs(MoveMotion(THERE)) == needs(NavigateActionPerformable(THERE)) == {BASE_PART}
-    assert needs(LookingMotion(THERE)) == {HEAD_PART}
-    assert needs(MoveGripperMotion(GripperState.OPEN, Arms.RIGHT)) == {RIGHT_PART}
-    assert needs(SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN)) == {LEFT_PART}
-    assert needs(ParkArmsActionPerformable(Arms.BOTH)) == {LEFT_PART, RIGHT_PART}
-    assert needs(MoveTorsoActionPerformable(0.2)) == {TORSO}
-    assert needs(MoveArmJointsMotion({"l_elbow_flex_joint": -1.0})) == {LEFT_PART}
-    assert needs(MoveArmJointsMotion(None, {"r_elbow_flex_joint": -1.0})) == {RIGHT_PART}
-    assert needs(FaceAtPerformable(THERE)) == {BASE_PART, HEAD_PART}
-
-
-def test_a_reach_for_a_pose_in_the_map_requires_the_robot_to_stand_still(scene: Scene) -> None:
-    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
-    assert needs(MoveTCPMotion(THERE, Arms.LEFT)) == {LEFT_PART, BASE_PART, TORSO}
-    assert needs(PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT)) == {RIGHT_PART, BASE_PART, TORSO}
-    assert needs(PlaceActionPerformable(scene.milk, Arms.RIGHT, THERE)) == {RIGHT_PART, BASE_PART, TORSO}
-    assert needs(GripActionPerformable(Arms.LEFT, scene.milk, 1.0)) == {LEFT_PART, BASE_PART, TORSO}
-    assert needs(OpenActionPerformable(handle, Arms.LEFT)) == {LEFT_PART, BASE_PART, TORSO}
-    assert needs(MoveAndPickUpPerformable(THERE, scene.milk, Arms.LEFT, Grasp.TOP)) == {
-        LEFT_PART,
-        BASE_PART,
-        TORSO,
-        HEAD_PART,
-    }
-    assert needs(TransportActionPerformable(scene.milk, Arms.LEFT, THERE)) == {LEFT_PART, RIGHT_PART, BASE_PART, TORSO}
-    assert needs(DetectActionPerformable(scene.milk)) == {HEAD_PART}
+def test_a_designator_requires_its_parts_and_one_that_reaches_for_a_place_that_the_robot_stands_still(
+    scene: Scene,
+) -> None:
+    for make, parts in REQUIRED:
+        assert needs(designator := make(scene)) == parts, designator
 
 
 def test_joints_by_name_require_the_parts_they_belong_to(scene: Scene) -> None:
     names = ["torso_lift_joint", "head_pan_joint", "r_elbow_flex_joint", "l_gripper_l_finger_joint", "no_such_joint"]
-    assert needs(MoveJointsMotion(names, [0.0] * 5)) == {TORSO, HEAD_PART, RIGHT_PART, LEFT_PART}
+    assert needs(MoveJointsMotion(names, [0.0] * 5)) == {TORSO, HEAD, RIGHT, LEFT}
     assert needs(MoveJointsMotion(["no_such_joint"], [0.0])) == set()

@@ -107,28 +107,6 @@ def test_an_exception_that_ends_the_process_ends_its_nodes(raised: type[BaseExce
     assert recording.notes == ["start Inside", "start Raising", f"end Raising {status}", f"end Inside {status}"]
 
 
-async def test_a_recorder_is_notified_of_each_start_and_end_once_in_legal_order() -> None:
-    with Recording().listening() as recording:
-        await Inside([Empty(), Inside([Empty()])]).perform()
-        with pytest.raises(PlanFailure):
-            await Inside([Raising(PlanFailure()), Empty()]).perform()
-    assert recording.notes == [
-        "start Inside",
-        "start Empty",
-        "end Empty SUCCEEDED",
-        "start Inside",
-        "start Empty",
-        "end Empty SUCCEEDED",
-        "end Inside SUCCEEDED",
-        "end Inside SUCCEEDED",
-        "start Inside",
-        "start Raising",
-        "end Raising FAILED",
-        "end Inside FAILED",
-    ]
-    assert recording.open == []
-
-
 async def test_a_recorder_that_refuses_a_start_keeps_perform_from_running() -> None:
     class Refusing(Recording):
         def node_started(self, node: TaskTreeNode) -> None:

@@ -133,19 +133,13 @@ async def test_experience_with_upright_objects_is_not_carried_over_to_a_lying_on
     assert place.pose.yaw == pytest.approx(0)
 
 
-async def test_the_requested_arm_is_queried(scene: Scene) -> None:
-    known_poses = Known(past())
-    await location_from(scene, known_poses, arm=Arms.RIGHT).resolve()
-    await location_from(scene, known_poses).resolve()
-    assert known_poses.asked == [(ObjectType.MILK, Arms.RIGHT), (ObjectType.MILK, None)]
-
-
-async def test_places_are_queried_for_the_height_of_the_target_over_the_base(scene: Scene) -> None:
+async def test_places_are_queried_for_the_arm_and_for_the_height_of_the_target_over_the_base(scene: Scene) -> None:
     known_poses = Known(past())
     scene.robot.set_pose(Pose([0, 0, 0.25]))
-    for height in (0.9, 0.7):
+    for height, arm in ((0.9, Arms.RIGHT), (0.7, None)):
         scene.milk.set_pose(Pose([1.3, 1, height]))
-        await location_from(scene, known_poses).resolve()
+        await location_from(scene, known_poses, arm=arm).resolve()
+    assert known_poses.asked == [(ObjectType.MILK, Arms.RIGHT), (ObjectType.MILK, None)]
     assert known_poses.heights == pytest.approx([0.65, 0.45])
 
 

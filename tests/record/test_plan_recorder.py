@@ -17,30 +17,22 @@ from pycrorm_async.events.types import (
     DescriptionDeclared,
     EpisodeEnded,
     EpisodeStarted,
-    JointsMoved,
     LocationResolved,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectMoved,
-    ObjectReference,
-    ObjectRemoved,
     PoseValue,
 )
 from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable
 from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Search
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.motions import simulated_robot
-from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
 from pycrorm_async.plan.task import current_node
 from pycrorm_async.record.plan_recorder import Episode, current_episode
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from tests.record.fakes import (
-    CarryActionPerformable,
     NoteActionPerformable,
     RecorderCase,
     findings,
@@ -102,96 +94,6 @@ async def test_the_robot_state_is_that_at_the_start_of_the_node() -> None:
     assert [robot.object_type for robot in robots if robot] == ["ROBOT"] * 3
 
 
-async def test_an_object_parameter_names_its_current_row() -> None:
-    with recorder_case() as case, case.episode() as episode, BulletWorld():
-        milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
-        await CarryActionPerformable(ObjectDesignator("milk", ObjectType.MILK, milk)).perform()
-        milk.set_pose(Pose([5.0, 5.0, 0.0]))
-        await CarryActionPerformable(milk).perform()  # type: ignore[arg-type]  # a world object serves as well
-        milk.set_pose(Pose([6.0, 6.0, 0.0]))
-    events = case.sink.of(episode)
-    added = next(sequence for sequence, event in events if isinstance(event, ObjectAdded))
-    moved = [sequence for sequence, event in events if isinstance(event, ObjectMoved)]
-    carried = [
-        event.parameters["what"] for _, event in events if isinstance(event, NodeStarted) and event.kind == "action"
-    ]
-    assert carried == [{"object": added, "row": added}, {"object": added, "row": moved[0]}]
-    poses = dict(events)
-    assert isinstance(poses[moved[0]], ObjectMoved)
-    assert poses[moved[0]].pose.position == (5.0, 5.0, 0.0)  # type: ignore[attr-defined]
-    assert findings(events) == []
-
-
-async def test_a_part_brings_its_own_value_and_its_whole() -> None:
-    with recorder_case() as case, case.episode() as episode, BulletWorld():
-        kitchen = Object("kitchen", ObjectType.ENVIRONMENT)
-        part = ObjectPart("kitchen_island_surface", kitchen)
-        await CarryActionPerformable(ObjectDesignator("kitchen", ObjectType.ENVIRONMENT, kitchen), part).perform()
-        where = kitchen.link_pose("kitchen_island_surface")
-    value = next(
-        event.parameters["part"]
-        for _, event in case.sink.of(episode)
-        if isinstance(event, NodeStarted) and event.kind == "action"
-    )
-    assert value["dtype"] == "ObjectPart"
-    assert value["name"] == "kitchen_island_surface"
-    assert value["part_of"] == {"object": 3, "row": 3}
-    assert value["pose"]["position"] == list(where.position)
-
-
-async def test_attaching_carrying_and_detaching_are_events_with_their_cause() -> None:
-    @dataclass
-    class HoldActionPerformable(ActionAbstract):
-        async def perform(self) -> None:
-            robot.attach(milk, "l_gripper_tool_frame")
-            robot.set_pose(Pose([1.0, 0.0, 0.0]))
-            robot.detach(milk)
-
-    with recorder_case() as case, case.episode() as episode, BulletWorld():
-        robot = Object("pr2", ObjectType.ROBOT)
-        milk = Object("milk", ObjectType.MILK, pose=Pose([0.5, 0.0, 0.9]))
-        await HoldActionPerformable().perform()
-        robot.set_joint_position("torso_lift_joint", 0.1)
-    events = case.sink.of(episode)
-    node = next(sequence for sequence, event in events if isinstance(event, NodeStarted) and event.kind == "action")
-    attached, detached = (
-        next(event for _, event in events if isinstance(event, kind)) for kind in (ObjectAttached, ObjectDetached)
-    )
-    assert attached == ObjectAttached(ObjectReference(3, 3), ObjectReference(4, 4), "l_gripper_tool_frame", node)
-    moves = [(event.name, event.pose.position, event.node) for _, event in events if isinstance(event, ObjectMoved)]
-    assert [(name, cause) for name, _, cause in moves] == [("pr2", node), ("milk", node)]
-    assert moves[1][1] == pytest.approx((1.5, 0.0, 0.9), abs=1e-6)
-    assert isinstance(detached, ObjectDetached)
-    assert detached.child.object == 4
-    assert detached.child.row > 4
-    joints = [event for _, event in events if isinstance(event, JointsMoved)]
-    assert [(each.joints, each.node) for each in joints] == [({"torso_lift_joint": 0.1}, None)]
-    assert findings(events) == []
-
-
-async def test_a_world_entered_before_belongs_to_each_open_episode() -> None:
-    with recorder_case() as case, BulletWorld():
-        robot = Object("pr2", ObjectType.ROBOT)
-        milk = Object("milk", ObjectType.MILK, pose=Pose([0.5, 0.0, 0.9]))
-        robot.attach(milk, "l_gripper_tool_frame")
-        with case.episode() as first:
-            milk.set_pose(Pose([0.6, 0.0, 0.9]))
-        milk.set_pose(Pose([0.7, 0.0, 0.9]))
-        with case.episode() as second:
-            pass
-    added = [
-        [(e.name, e.pose.position) for _, e in case.sink.of(each) if isinstance(e, ObjectAdded)]
-        for each in (first, second)
-    ]
-    assert added == [
-        [("pr2", (0.0, 0.0, 0.0)), ("milk", (0.5, 0.0, 0.9))],
-        [("pr2", (0.0, 0.0, 0.0)), ("milk", (0.7, 0.0, 0.9))],
-    ]
-    assert kinds(case.sink.of(first)).count("ObjectMoved") == 1
-    assert kinds(case.sink.of(second)).count("ObjectMoved") == 0
-    assert kinds(case.sink.of(second)).count("ObjectAttached") == 1
-
-
 async def test_a_perform_outside_any_episode_opens_one_of_its_own() -> None:
     with recorder_case() as case:
         await NoteActionPerformable("a").perform()
@@ -239,16 +141,6 @@ async def test_a_resolved_location_is_recorded_with_its_node() -> None:
     assert [each.reason for each in event.refused] == ["LEFT: too far", "hidden\\x00"]
     assert {each.pose for each in event.refused} == {event.offered[0].pose}
     assert event.cells == CellsValue(3, 2, 9)
-
-
-async def test_leaving_a_world_removes_its_objects() -> None:
-    with recorder_case() as case, case.episode() as episode:
-        for _ in range(2):
-            with BulletWorld():
-                Object("milk", ObjectType.MILK)
-    changes = [(type(e).__name__, e.object.object) for _, e in case.sink.of(episode) if isinstance(e, ObjectRemoved)]
-    assert changes == [("ObjectRemoved", 3), ("ObjectRemoved", 5)]
-    assert findings(case.sink.of(episode)) == []
 
 
 async def test_an_implicit_episode_restores_the_context() -> None:
