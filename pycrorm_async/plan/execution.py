@@ -53,13 +53,12 @@ from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.plan.failures import Resource, ResourceDeadlock, is_plan_failure
 from pycrorm_async.plan.task import Performable, TaskTreeNode, collecting, current_node
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.bullet import current_world
+from pycrorm_async.world.bullet import BulletWorld, current_world
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType, Pose
 from pycrorm_async.world.world_copy import acting_robot
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.objects import ObjectLike
-    from pycrorm_async.world.bullet import BulletWorld
 
 
 # === node execution ===========================================================================================

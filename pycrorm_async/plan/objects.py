@@ -22,14 +22,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeAlias
 from pycrorm_async.clock import SYSTEM_CLOCK, microseconds_of, utc_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import failures
-from pycrorm_async.world.bullet import Object, current_world
+from pycrorm_async.world.bullet import BulletWorld, Object, current_world
 from pycrorm_async.world.pose import Arms, GripperState, NoWorld, ObjectType, Pose
 from pycrorm_async.world.urdf import ArmDescription, RobotDescription
 from pycrorm_async.world.world_copy import acting_robot, counterpart, original, related
-
-if TYPE_CHECKING:
-    from pycrorm_async.world.bullet import BulletWorld
-
 
 _T = TypeVar("_T")
 

@@ -22,19 +22,18 @@ from pycrorm_async.events import fields as event_fields
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.events.types import ItemType
 from pycrorm_async.record.values import Field, clean, clean_repr, cut, encoder_of, recorded_as, refuse
 from pycrorm_async.recorded_names import recorded_name
 
 RecordedKind: TypeAlias = Literal["action", "motion", "language"]
-FieldSpec: TypeAlias = event_types.FieldType | tuple[event_types.FieldType, ItemType] | type[Any]
+FieldSpec: TypeAlias = event_types.FieldType | tuple[event_types.FieldType, event_types.ItemType] | type[Any]
 """`real`; `("list", "real")`; or a Python type: `float`, an `Enum` class, `list[float]`, `Pose`."""
 
 _REASON_MAX = 500
 """Bounds the characters of the reason why a field or type cannot be declared; reasons may quote a user's names."""
 _TYPES: frozenset[str] = frozenset(get_args(event_types.FieldType))
 _WITHOUT_ITEMS = _TYPES - {"list", "dict"}
-_ITEMS: frozenset[str] = frozenset(get_args(ItemType))
+_ITEMS: frozenset[str] = frozenset(get_args(event_types.ItemType))
 
 
 class DeclaredType(NamedTuple):
@@ -315,7 +314,7 @@ class FieldShape(NamedTuple):
 
     kind: event_types.FieldType
     optional: bool = False
-    item: ItemType | None = None
+    item: event_types.ItemType | None = None
     enum: type[Enum] | None = None
     nested: type | None = None
 
@@ -385,7 +384,7 @@ def _container_shape(origin: type, arguments: tuple[Any, ...]) -> FieldShape | N
     item = shape_of(value)
     if item is None or item.nested is not None or item.kind in ("list", "dict"):
         return None
-    return FieldShape(kind, item=typing.cast("ItemType", item.kind), enum=item.enum)
+    return FieldShape(kind, item=typing.cast("event_types.ItemType", item.kind), enum=item.enum)
 
 
 # === known types ==============================================================================================

@@ -17,7 +17,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events import types as event_types
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import EpisodeId, is_named
-from pycrorm_async.events.types import ObjectDetected
 from pycrorm_async.record.arguments import ArgumentReader, Convert, RecordedValues, pose_of, struct_of
 from pycrorm_async.record.camera import CameraStream, put_image
 from pycrorm_async.record.declarations import DeclaredType
@@ -464,7 +463,7 @@ class RecordedEpisode:
         """Record a result of perception; `object_type` is the type searched for."""
         copied = (noted(self.emitter, "ObjectDetected", struct_of, each, event_types.SeenValue) for each in seen)
         percepts = [replace(each, pose=event_types.BriefPose.of(each.pose)) for each in copied if each is not None]
-        event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
+        event = struct_of(event_types.ObjectDetected(source, object_type), event_types.ObjectDetected)
         return lambda: self._writer.detect(event, percepts, node)
 
     @reported("EpisodeTagged")

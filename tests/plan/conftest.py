@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
 
 from pycrorm_async.plan import simulated_robot
-from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, WorldMode
-from pycrorm_async.world.urdf import PR2
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode
 
 
 class Scene(NamedTuple):
@@ -40,9 +38,3 @@ def scene() -> Iterator[Scene]:
     """The kitchen, for the whole of a test."""
     with kitchen() as kitchen_scene:
         yield kitchen_scene
-
-
-@pytest.fixture
-def one_armed(scene: Scene) -> None:
-    """Replace the scene's robot by one that has only a left arm."""
-    scene.robot.robot_description = replace(PR2, arms={Arms.LEFT: PR2.arms[Arms.LEFT]})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -248,7 +249,8 @@ async def test_both_arms_for_an_action_of_one_are_a_failure_and_move_nothing(sce
     assert scene.world.save_state() == before
 
 
-async def test_an_arm_that_the_robot_lacks_is_a_failure_and_moves_nothing(scene: Scene, one_armed: None) -> None:
+async def test_an_arm_that_the_robot_lacks_is_a_failure_and_moves_nothing(scene: Scene) -> None:
+    scene.robot.robot_description = replace(PR2, arms={Arms.LEFT: PR2.arms[Arms.LEFT]})
     before = scene.world.save_state()
     missing = [
         *one_handed(scene, Arms.RIGHT),

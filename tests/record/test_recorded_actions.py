@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import math
 from datetime import UTC, datetime
@@ -20,7 +19,6 @@ from pycrorm_async.orm import (
     Language,
     Monitor,
     Motion,
-    ProcessMetaData,
     Repeat,
     Sequential,
     TaskTreeNode,
@@ -133,34 +131,6 @@ async def test_the_classes_of_actions_and_motions_return_no_expressions(tmp_path
         assert [each.kind for each in everything] == ["language", "action", "motion", "action", "motion"]
         async with memory.session() as session:
             assert await session.scalar(select(func.count()).select_from(Action)) == 2
-
-
-async def test_an_interruption_is_recorded_as_one(tmp_path: Path) -> None:
-    begun = asyncio.Event()
-
-    async def waits() -> None:
-        begun.set()
-        await asyncio.sleep(60)
-
-    async with Memory.open(url_of(tmp_path)) as memory:
-        async with memory.episode(description="plan"):
-            await ((note("a") + Calling(waits) >> Watching(begun)) + note("b")).perform()
-        await memory.flush()
-        nodes = await every(memory, select(TaskTreeNode).order_by(TaskTreeNode.id))
-        assert [(node.dtype, node.status.name, node.reason, node.result) for node in nodes] == [
-            (None, "SUCCEEDED", None, None),
-            ("Sequential", "SUCCEEDED", None, {"succeeded": [0, 1]}),
-            ("Monitor", "INTERRUPTED", None, {"interrupted": True}),
-            ("Sequential", "INTERRUPTED", "CancelledError", None),
-            ("NoteAction", "SUCCEEDED", None, None),
-            ("Code", "INTERRUPTED", "CancelledError", None),
-            ("NoteAction", "SUCCEEDED", None, None),
-        ]
-        interrupted = select(Monitor).join(Monitor.node).where(TaskTreeNode.status == TaskStatus.INTERRUPTED)
-        (monitor,) = await every(memory, interrupted)
-        assert monitor.condition == "asyncio.locks.Event"
-        (episode,) = await every(memory, select(ProcessMetaData))
-        assert episode.status == "SUCCEEDED"
 
 
 # === object designators =======================================================================================

@@ -19,7 +19,6 @@ from pycrorm_async.orm import (
     EpisodeRobot,
     NavigateAction,
     ParkArmsAction,
-    PickUpWithContextView,
     ProcessMetaData,
     TaskTreeNode,
 )
@@ -221,23 +220,6 @@ async def test_every_episode_names_its_robots_with_model_serial_and_description(
     assert rows == [(2, each.name, each.model, each.serial, each.description) for each in two.robots]
     moment = pycrorm("show", "2", "--at", "9", "--url", database_url, cwd=tmp_path).stdout
     assert "eve at (1.000, 0.000), heading 0.0°; many at (0.000, 0.000), heading 0.0°" in moment
-
-
-async def test_a_pick_up_names_its_robot_in_the_view_for_learning(
-    database_url: str, robots: tuple[Object, Object], tmp_path: Path
-) -> None:
-    ada, bob = robots
-    bob.set_pose(Pose([0, 2, 0]))
-    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
-        for robot, y in ((ada, 0.2), (bob, 2.2)):
-            milk = Object(f"milk of {robot.name}", ObjectType.MILK, pose=Pose([0.8, y, 0.9]))
-            with robot_acting(robot):
-                await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
-                assert milk.attached_to is robot
-        await memory.flush()
-        async with memory.session() as session:
-            rows = (await session.execute(select(PickUpWithContextView.robot, PickUpWithContextView.relative_y))).all()
-    assert sorted((name, round(y, 6)) for name, y in rows) == [("ada", -0.2), ("bob", -0.2)]
 
 
 async def test_parallel_branches_of_two_robots_do_not_wait_for_each_others_parts(
