@@ -316,7 +316,7 @@ class Memory:
         text = description or plan or "an episode"
         labels = read_labels(tags, metadata, self._settings, parts.emitter.missing)
         with parts.in_context():
-            async with parts.recorder.episode(description=text, plan=plan, seed=seed, labels=labels) as episode:
+            async with parts.recorder.episode(description=text, plan=plan, seed=seed, **labels) as episode:
                 yield episode
 
     async def tag(self, episode: AskedEpisode, *tags: str, remove: Sequence[str] = ()) -> None:

@@ -8,7 +8,7 @@ import platform
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.errors import CallerError
@@ -29,9 +29,11 @@ _METADATA_BYTES_MAX: Final = 64 * 2**10
 """Bounds the metadata of an episode, which is one column: a page of settings, not data."""
 
 
-def check_arguments(seed: object, **texts: object) -> None:
+def check_opening(opening: EpisodeOpening) -> None:
     """Check that an episode's arguments fit its columns. Raises `CallerError` naming the argument."""
-    for name, text in texts.items():
+    seed = cast("object", opening.seed)
+    for name in ("description", "plan", "world", "created_by"):
+        text = getattr(opening, name)
         if text is not None and not isinstance(text, str):
             raise CallerError(f"the {name} of an episode must be a str, not {text!r:.100}")
     # A bool is an int, but a reader of the event refuses it.
@@ -39,10 +41,8 @@ def check_arguments(seed: object, **texts: object) -> None:
         raise CallerError(f"the seed of an episode must be an int of at most 64 bits, not {seed!r:.100}")
 
 
-def read_labels(
-    tags: Iterable[str], metadata: object, settings: Settings, missing: MissingValues
-) -> tuple[tuple[str, ...], Mapping[str, Any]]:
-    """Return the tags of an episode, checked, and its metadata as JSON values.
+def read_labels(tags: Iterable[str], metadata: object, settings: Settings, missing: MissingValues) -> dict[str, Any]:
+    """Return the tags of an episode, checked, and its metadata as JSON values, by their names in `EpisodeOpening`.
 
     A value of the metadata that cannot be recorded is null, and counted as missing. Raises `CallerError` if the
     tags are not a list of short texts, and for metadata without text keys.
@@ -61,7 +61,7 @@ def read_labels(
     if size > min(_METADATA_BYTES_MAX, settings.record_bytes_max // 4):
         missing.note("Episode", "metadata", f"it takes {size:,} bytes, {_METADATA_BYTES_MAX:,} are allowed")
         values = {}
-    return checked, values
+    return {"tags": checked, "metadata": values}
 
 
 def _refuse_blob(_content: bytes, _media_type: str) -> Any:

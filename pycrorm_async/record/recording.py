@@ -170,22 +170,28 @@ class Recording:
             CallerError: an argument has a wrong type or value. Any other fault is counted, and the episode stays empty.
         """
         text = description or plan or "an episode"
-        unchecked: tuple[object, object, object] = (simulated, seed, failures)  # as the caller passed them
+        unchecked: tuple[object, object] = (simulated, failures)  # as the caller passed them
         identity = None if id is None else _identity(id)
         if at is not None:
             event_time(at)
-        if created_by is not None and not isinstance(created_by, str):
-            raise CallerError(f"created_by must be a str, not {created_by!r:.100}")
-        if not isinstance(unchecked[0], bool) or isinstance(unchecked[1], bool):
-            raise CallerError("simulated must be a bool, and seed an int")
+        if not isinstance(unchecked[0], bool):
+            raise CallerError(f"simulated must be a bool, not {simulated!r:.100}")
         if convert is not None and not callable(convert):
             raise CallerError(f"convert must be a function, not {convert!r:.100}")
-        if not isinstance(unchecked[2], tuple) or not all(isinstance(each, builtins.type) for each in unchecked[2]):
+        if not isinstance(unchecked[1], tuple) or not all(isinstance(each, builtins.type) for each in unchecked[1]):
             raise CallerError(f"failures must be a tuple of classes of exceptions, not {failures!r:.100}")
         labels = openings.read_labels(tags, metadata, self.emitter.settings, self.emitter.missing)
         opening = self.opening(
-            text, plan=plan, seed=seed, labels=labels, world=world, simulated=simulated, thought_by=thought_by
-        )._replace(created_by=created_by, is_past=at is not None)
+            text,
+            plan=plan,
+            seed=seed,
+            world=world,
+            simulated=simulated,
+            thought_by=thought_by,
+            created_by=created_by,
+            is_past=at is not None,
+            **labels,
+        )
         episode = RecordedEpisode(
             self.emitter, self.episodes, self._calls, opening, convert, failures, id=identity, at=at
         )
@@ -195,24 +201,14 @@ class Recording:
             episode.open(self._stored_episodes if identity is not None else None)
         return episode
 
-    def opening(
-        self,
-        description: str,
-        *,
-        plan: str | None = None,
-        seed: int | None = None,
-        labels: tuple[tuple[str, ...], Mapping[str, Any]] = ((), {}),
-        world: str | None = None,
-        simulated: bool = False,
-        thought_by: NodeReference | None = None,
-    ) -> openings.EpisodeOpening:
-        """Check the arguments of an episode; texts that are too long are cut later. Raises `CallerError`."""
-        openings.check_arguments(seed, plan=plan, description=description, world=world)
-        if thought_by is not None and not _is_whole(thought_by):
-            raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
-        return openings.EpisodeOpening(
-            description, self._software, plan, seed, world, simulated, thought_by, self._provenance, *labels
-        )
+    def opening(self, description: str, **further: Any) -> openings.EpisodeOpening:
+        """Return the arguments of an episode, checked; texts that are too long are cut later. Raises `CallerError`."""
+        opening = openings.EpisodeOpening(description, self._software, provenance=self._provenance, **further)
+        openings.check_opening(opening)
+        if opening.thought_by is not None and not _is_whole(opening.thought_by):
+            by = opening.thought_by
+            raise CallerError(f"thought_by must be from `node_reference` of an episode, not {by!r:.100}")
+        return opening
 
     def note_fault(self, where: str, error: BaseException) -> None:
         """Count a fault of an integration in `Memory.status`; log the 1st, 2nd, 4th, 8th and so on. Raises nothing."""
