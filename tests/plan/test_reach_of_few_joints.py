@@ -102,9 +102,11 @@ AHEAD = (  # a lift beside the middle of the base, and the joints of an arm whos
 )
 
 
-@pytest.mark.parametrize(("joints", "tool"), [(SIDEWAYS, "0 -0.23 0"), (AHEAD, "0.012 0 0.2")])
+@pytest.mark.parametrize(
+    ("joints", "tool", "yaws"), [(SIDEWAYS, "0 -0.23 0", (4, 0.5)), (AHEAD, "0.012 0 0.2", (0, 2))]
+)
 async def test_a_lift_and_few_joints_find_places_and_headings_from_which_they_pick_up_and_place(
-    joints: tuple[tuple[str, str, str], ...], tool: str
+    joints: tuple[tuple[str, str, str], ...], tool: str, yaws: tuple[float, float]
 ) -> None:
     text = arm_of(*joints)
     turn = "0 0 -1.570796" if joints is SIDEWAYS else "0 -1.570796 0"
@@ -120,8 +122,8 @@ async def test_a_lift_and_few_joints_find_places_and_headings_from_which_they_pi
     )
     with BulletWorld(), simulated_robot_within(Limits.SOFT):
         robot = Object("robot", ObjectType.ROBOT, robot=robot_described)
-        milk = Object("milk", ObjectType.MILK, pose=Pose([1.85, 0.1, 0.85]))
-        there = Pose([-1, -1, 0.8], yaw_quaternion(2))
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.85, 0.1, 0.85], yaw_quaternion(yaws[0])))
+        there = Pose([-1, -1, 0.8], yaw_quaternion(yaws[1]))
         place = CostmapLocation(target=milk, reachable_for=robot).resolve()
         await NavigateActionPerformable(place.pose).perform()
         await PickUpActionPerformable(milk, Arms.RIGHT, Grasp.FRONT).perform()

@@ -56,7 +56,7 @@ def test_a_number_takes_less_than_thirty_bytes_on_disk(tmp_path: Path) -> None:
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return (tmp_path / "memory.db").stat().st_size
 
-    numbers = np.random.default_rng(2).normal(size=(8_000, 7))
+    numbers = np.random.default_rng(2).normal(size=(2_000, 7))
     with opened(tmp_path):
         pass
     before = size()
