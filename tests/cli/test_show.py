@@ -18,7 +18,6 @@ from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
 from tests.hand_written import hand_written
 from tests.projections.event_script import Script, append_and_fold
-from tests.store.factories import episode, run_of
 
 pytestmark = pytest.mark.slow
 
@@ -334,20 +333,6 @@ def test_no_character_is_lost_on_a_terminal_with_ascii_alone(tmp_path: Path) -> 
         check=True,
     )
     assert json.loads(done.stdout)["payload"]["text"] == "Grüße, 牛奶"
-
-
-def test_a_reader_that_closes_the_pipe_ends_the_command_without_a_message(tmp_path: Path) -> None:
-    asyncio.run(append_and_fold(f"sqlite:///{tmp_path}/pycrorm.db", run_of(episode(1), 1, 5_000), folded=False))
-    process = subprocess.Popen(
-        [*COMMAND, "events", "1"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    assert json.loads(process.stdout.readline())["sequence"] == 1
-    process.stdout.close()
-    assert process.stderr.read() == b""
-    assert process.wait(60) == 0
-    process.stderr.close()
 
 
 async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import shutil
-import sqlite3
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -273,27 +272,3 @@ async def test_a_daemon_ends_when_its_database_file_is_replaced_and_waits_when_t
 def test_an_impossible_writer_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
     with pytest.raises(CallerError, match=words):
         open_it()
-
-
-async def test_a_locked_database_is_unavailable_to_the_daemon_and_closing_does_not_wait_for_it(
-    tmp_path: Path, spool: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    url = f"sqlite:///{tmp_path / 'memory.db'}"
-    started = Daemon(url, spool)
-    async with memory_at(url, spool) as memory:
-        await NoteActionPerformable("a").perform()
-        await memory.flush()
-        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
-        other.execute("BEGIN IMMEDIATE")
-        await NoteActionPerformable("b").perform()
-        await started.wait_for_line("the database is unavailable: .*locked; retrying")
-    [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
-    assert "the daemon reports that the database is unavailable" in line
-    other.execute("COMMIT")
-    other.close()
-    await started.wait_for_line("the database is available again after")
-    await started.wait_for_line("is recovered")
-    started.leave.set()
-    await started.task
-    async with Reading.open(url) as reading:
-        assert await texts(reading) == ["a", "b"]

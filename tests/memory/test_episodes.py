@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import os
-import threading
 from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -19,9 +17,8 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, recover
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked, LogDamaged
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, episode_text
-from pycrorm_async.operations import copy as operation
 from pycrorm_async.operations.copy import copy_episodes, tag_episode
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import EpisodeTag, PickUpWithContextView, ProcessMetaData
@@ -114,48 +111,6 @@ async def test_several_processes_tag_an_episode_at_once_and_every_tag_is_there(
     async with Reading.open(database_url) as reading:
         assert await tags_of(reading) == {"one": [f"tag {number}" for number in range(6)]}
     await assert_intact(database_url)
-
-
-@pytest.mark.slow
-async def test_tagging_an_episode_with_a_damaged_tag_names_the_event(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/memory.db"
-    async with Memory.open(url, spool=tmp_path / "spool") as memory, memory.episode(description="one"):
-        pass
-    tagged = await tag_episode(DatabaseAddress.parse(url), "1", ("kitchen",), ())
-    ask_to_change(url, "DROP TRIGGER event_is_not_updated")
-    ask_to_change(url, "UPDATE event SET payload = '{\"added' WHERE type = 'EpisodeTagged'")
-    with pytest.raises(LogDamaged, match="its payload cannot be read") as refused:
-        await tag_episode(DatabaseAddress.parse(url), "1", ("night",), ())
-    assert (refused.value.episode, refused.value.sequence) == (tagged.id, 5)
-
-
-@pytest.mark.slow
-@pytest.mark.soak_on("postgresql")
-async def test_a_process_killed_between_event_and_tables_leaves_a_tag_that_the_next_fold_shows(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async with Memory.open(database_url, spool=tmp_path / "spool") as memory, memory.episode(description="one"):
-        pass
-    pid = os.fork()
-    if pid == 0:
-
-        async def kill(*_: object) -> bool:
-            os.kill(os.getpid(), 9)
-            return True
-
-        monkeypatch.setattr(operation, "_fold", kill)
-        thread = threading.Thread(
-            target=lambda: asyncio.run(tag_episode(DatabaseAddress.parse(database_url), "1", ("late",), ()))
-        )
-        thread.start()
-        thread.join()
-        os._exit(1)
-    _, status = await asyncio.to_thread(os.waitpid, pid, 0)
-    assert os.WTERMSIG(status) == 9
-    await assert_intact(database_url, behind=1)
-    await recover(database_url, spool=tmp_path / "spool")
-    async with Reading.open(database_url) as reading:
-        assert await tags_of(reading) == {"one": ["late"]}
 
 
 @pytest.mark.slow

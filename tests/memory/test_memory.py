@@ -13,21 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings
 from pycrorm_async.errors import (
     CallerError,
-    DatabaseForeign,
     DatabaseUnavailable,
     FlushTimeout,
     SpoolForeign,
     SpoolStuck,
-    UnknownUrl,
 )
-from pycrorm_async.orm import ProcessMetaData
-from pycrorm_async.plan import PlanFailure
-from pycrorm_async.plan.execution import recorder
 from tests.commands import answer
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
@@ -68,43 +62,9 @@ async def test_flushed_records_are_in_the_tables_and_in_the_database_file(tmp_pa
         assert await texts(reading) == ["a", "b"]
 
 
-async def test_an_exception_leaves_the_plan_unchanged_and_is_recorded(tmp_path: Path) -> None:
-    with pytest.raises(PlanFailure, match="spilled"):
-        async with Memory.open(url_of(tmp_path)) as memory, memory.episode(description="e"):
-            await NoteActionPerformable("a").perform()
-            raise PlanFailure("spilled")
-    async with Reading.open(url_of(tmp_path)) as reading:
-        (episode,) = await reading.episodes()
-        assert (episode.status, episode.nodes) == ("FAILED", 2)
-        async with reading.session() as session:
-            metadata = (await session.scalars(select(ProcessMetaData))).one()
-            assert metadata.failure_type == "pycrorm_async.plan.failures.PlanFailure"
-            assert metadata.failure_message == "spilled"
-
-
 # === refusals =================================================================================================
 #
 # Refusals by a memory and their messages; no recorded event is lost by one.
-
-
-@pytest.mark.slow
-async def test_bad_addresses_are_refused_with_their_class(tmp_path: Path) -> None:
-    with pytest.raises(UnknownUrl):
-        Memory.open("mysql://lab/memory")
-    for url, error in (
-        (f"sqlite:///{tmp_path}/none/memory.db", DatabaseUnavailable),
-        ("postgresql://ada:secret@lab/memory", DatabaseUnavailable),
-    ):
-        with pytest.raises(error) as refused:
-            async with Memory.open(url):
-                pass
-        assert "secret" not in str(refused.value)
-    (tmp_path / "text.db").write_text("no database at all, and rather more than a hundred bytes of it" * 10)
-    with pytest.raises(DatabaseForeign):
-        async with Memory.open(f"sqlite:///{tmp_path}/text.db"):
-            pass
-    assert not (tmp_path / "text.db.spool").exists()
-    assert recorder.get() is None
 
 
 @pytest.mark.slow

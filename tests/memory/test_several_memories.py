@@ -2,7 +2,6 @@
 
 import asyncio
 import contextvars
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,33 +30,6 @@ async def test_a_perform_is_recorded_by_the_memory_whose_episode_is_open(tmp_pat
         await two.flush()
         assert await texts(one) == ["to the one with the episode"]
         assert await texts(two) == ["to the last opened", "to the last opened again"]
-
-
-async def test_the_next_memory_adopts_the_folder_of_a_killed_process(tmp_path: Path) -> None:
-    script = (
-        "import asyncio, os, signal, sys\n"
-        "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
-        "async def main():\n"
-        "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='killed'):\n"
-        "        for index in range(50):\n"
-        "            await NoteActionPerformable(str(index)).perform()\n"
-        "        os.kill(os.getpid(), signal.SIGKILL)\n"
-        "asyncio.run(main())\n"
-    )
-    done = await asyncio.to_thread(run_script, script, url_of(tmp_path))
-    assert done.returncode == -9
-    async with Memory.open(url_of(tmp_path)) as memory:
-        await NoteActionPerformable("after").perform()
-        for _ in range(200):
-            await memory.flush()
-            result = await texts(memory)
-            if len(result) == 51:
-                break
-            await asyncio.sleep(0.05)
-        assert sorted(result) == sorted([*map(str, range(50)), "after"])
-        lost = [each for each in await memory.reading.episodes() if each.description == "killed"]
-        assert [each.status for each in lost] == ["LOST"]
-    assert [path for path in (tmp_path / "memory.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
 
 async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path: Path) -> None:
@@ -98,28 +70,6 @@ async def test_memories_closed_in_another_order_than_opened_record_their_own_pla
     await two.__aexit__(None, None, None)
     assert recorder.get() is None
     assert watcher.get() is None
-
-
-async def test_an_opening_that_fails_or_is_cancelled_leaves_no_thread(tmp_path: Path) -> None:
-    def ours() -> set[str]:
-        return {each.name for each in threading.enumerate() if each.name.startswith("pycrorm ")}
-
-    before = ours()
-    for turns in range(12):
-        task = asyncio.create_task(Memory.open(url_of(tmp_path)).__aenter__())
-        for _ in range(turns):
-            await asyncio.sleep(0.01)
-        if task.done():
-            await (await task).__aexit__(None, None, None)
-            continue
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-    for _ in range(500):
-        if ours() <= before:
-            break
-        await asyncio.sleep(0.02)
-    assert ours() <= before
 
 
 async def test_an_opening_that_is_cancelled_while_it_reads_the_types_closes_its_connection(

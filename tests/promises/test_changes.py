@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import msgspec
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseForeign
@@ -224,23 +224,6 @@ async def test_an_added_field_is_null_in_old_rows_and_a_removed_one_in_new_ones(
     await rebuild_memory(golden)
     assert differences(before, tables_of(golden)) == []
     assert await designators_of(golden, greet, "whom", "hand", "language") == expected
-
-
-async def test_a_renamed_field_can_be_queried_by_both_names(golden: str) -> None:
-    await performed(golden, greeting(guest=str)("Eve"))
-    async with Reading.open(golden) as reading, reading.session() as session:
-        greet: Any = reading.mapped("GreetAction")
-        guests = await session.scalars(select(func.coalesce(greet.guest, greet.whom)).order_by(greet.id))
-        assert list(guests) == ["Ada", "Cleo", "Dora", "Eve"]
-
-
-async def test_a_field_of_another_type_is_kept_under_its_type(golden: str) -> None:
-    await performed(golden, greeting(whom=int)(7))
-    expected = [(*ADA, None), (*CLEO, None), (*DORA, None), ("GreetAction", None, 7)]
-    assert await designators_of(golden, "GreetAction", "whom", "whom_integer") == expected
-    before = tables_of(golden)
-    await rebuild_memory(golden)
-    assert differences(before, tables_of(golden)) == []
 
 
 # --- a renamed designator ---------------------------------------------------------------------------------------------

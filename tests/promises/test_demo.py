@@ -1,9 +1,8 @@
 """The demonstration of the thesis (5.1) with this memory: its tree and its five answers, computed from the world."""
 
-from collections.abc import Awaitable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from sqlalchemy import select
@@ -28,7 +27,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
-from pycrorm_async.plan.execution import PlanObserver, Search, Simulation, recorder
+from pycrorm_async.plan.execution import PlanObserver, recorder
 from pycrorm_async.plan.task import TaskTreeNode as Node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
@@ -90,8 +89,8 @@ class WorldObserver:
         self.seen: list[tuple[str, Pose, float, Pose]] = []
         self.designators: list[Any] = []
 
-    def admit(self) -> Awaitable[None] | None:
-        return self.memory.admit()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.memory, name)
 
     def node_started(self, node: Node) -> None:
         if node.kind == "action":
@@ -100,21 +99,6 @@ class WorldObserver:
             self.seen.append((name, robot.pose, robot.joint_position("torso_lift_joint"), cereal.pose))
             self.designators.append(node.designator)
         self.memory.node_started(node)
-
-    def node_ended(self, node: Node) -> None:
-        self.memory.node_ended(node)
-
-    def location_resolved(self, search: Search) -> None:
-        self.memory.location_resolved(search)
-
-    def object_detected(self, **arguments: Any) -> None:
-        self.memory.object_detected(**arguments)
-
-    def simulation_started(self, simulation: Simulation) -> None:
-        self.memory.simulation_started(simulation)
-
-    def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
-        self.memory.simulation_ended(simulation, failure)
 
 
 def tree_text(nodes: list[Any]) -> str:
@@ -134,7 +118,7 @@ async def test_the_memory_of_the_demo_has_its_tree_and_its_answers(tmp_path: Pat
                 recorder_of_memory = recorder.get()
                 assert recorder_of_memory is not None
                 witness = WorldObserver(recorder_of_memory, world)
-                token = recorder.set(witness)
+                token = recorder.set(cast("Any", witness))
                 await breakfast()
                 recorder.reset(token)
                 resting = world.object("cereal").pose

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import random
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select
 
-from pycrorm_async import Memory, Reading
-from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async import Reading
 from pycrorm_async.plan import (
     ActionAbstract,
     NavigateActionPerformable,
@@ -21,9 +18,8 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import Chronicle, assert_same, read_from_memory
-from tests.promises.lab import WITHIN_REACH, Lab, every, lab, recorded, url_of
+from tests.promises.lab import WITHIN_REACH, Lab, lab, recorded, url_of
 
 pytestmark = pytest.mark.slow
 
@@ -87,74 +83,6 @@ async def test_every_change_by_a_plan_is_recorded_with_its_cause(tmp_path: Path)
         assert [(each.what, each.cause) for each in in_memory[len(chronicle.entries) :]] == [
             (("removed", name, chronicle.known_pose(name)), None) for name in ("pr2", "milk", "cereal")
         ]
-
-
-@dataclass
-class BranchActionPerformable(ActionAbstract):
-    label: str
-    _thing: Object
-
-    async def perform(self) -> None:
-        for step in range(1, 6):
-            await asyncio.sleep(0)
-            await StepActionPerformable(self.label, step, self._thing).perform()
-
-
-@dataclass
-class StepActionPerformable(ActionAbstract):
-    label: str
-    step: int
-    _thing: Object
-
-    async def perform(self) -> None:
-        await asyncio.sleep(0)
-        self._thing.set_pose(Pose([self.step, 0, 1]))
-        await asyncio.sleep(0)
-
-
-async def test_concurrent_branches_each_cause_their_own_changes(tmp_path: Path) -> None:
-    async with recorded(tmp_path) as memory:
-        chronicle = Chronicle()
-        with lab(chronicle) as scene:
-            async with asyncio.TaskGroup() as group:
-                for world_object in (scene.milk, scene.cereal, scene.robot):
-                    group.create_task(BranchActionPerformable(f"moves {world_object.name}", world_object).perform())
-        await memory.flush()
-        moved = [each.what[1] for each in chronicle.entries if each.what[0] == "moved"]
-        assert len(moved) == 15
-        assert len(set(moved[:3])) == 3  # they ran in turns
-        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
-        steps = {step.id: step for step in await every(memory, select(memory.mapped("StepAction")))}
-        rows = await every(memory, select(ObjectRow).where(ObjectRow.id != ObjectRow.identity_id))
-        caused = [steps[row.node_id] for row in rows]
-        assert [(f"moves {row.name}", row.pose.x) for row in rows] == [(step.label, step.step) for step in caused]
-
-
-async def test_each_episode_in_one_world_begins_with_all_its_objects(tmp_path: Path) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
-        with lab() as scene:
-            async with memory.episode(description="first"):
-                await NavigateActionPerformable(WITHIN_REACH).perform()
-                await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
-            scene.cereal.set_pose(Pose([9, 9, 9]))  # while no episode is open
-            async with memory.episode(description="second"):
-                scene.world.observe(chronicle := Chronicle())
-                chronicle.begin_with(scene.world.objects)
-                scene.world.reset()
-                scene.world.unobserve(chronicle)
-            scene.cereal.set_pose(Pose([8, 8, 8]))
-            await NoteActionPerformable("in an episode of its own").perform()
-        await memory.flush()
-        assert memory.status.faults.total == 0
-        in_memory = await read_from_memory(memory, 2)
-        # Attachments at the beginning of the episode follow its objects.
-        assert in_memory[3].what[:4] == ("attached", "pr2", "milk", ARM)
-        assert [each.what[:2] for each in in_memory[:3]] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
-        assert (in_memory[0].what[3]["l_gripper_l_finger_joint"], in_memory[2].what[2][:3]) == (0.0, (9, 9, 9))
-        assert_same(in_memory[4:], chronicle.entries)
-        third = await read_from_memory(memory, 3)
-        assert [each.what[:2] for each in third] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
-        assert third[2].what[2][:3] == (8, 8, 8)
 
 
 class RandomChanger:

@@ -182,27 +182,6 @@ async def test_an_ordinary_random_plan_follows_the_rules_of_the_language(plans: 
                 assert tree_of(journal.entries) == Interpreter().of(plan_of(each)), f"seed {each}: {plan_of(each)}"
 
 
-# --- concurrency ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("plans", [45, pytest.param(90, marks=pytest.mark.soak)])
-async def test_concurrent_plans_in_tasks_never_share_a_parent(tmp_path: Path, plans: int) -> None:
-    journals: dict[int, Journal] = {}
-
-    async def some(first: int) -> None:
-        for seed in range(first, plans, 3):
-            journals[seed] = await play(seed, memory)
-
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
-        async with asyncio.TaskGroup() as group:
-            for first in range(3):
-                group.create_task(some(first))
-        await memory.flush()
-    trees = recorded(tmp_path / "memory.db")
-    for seed, journal in journals.items():
-        assert trees.get(seed, []) == expected_rows(journal), f"seed {seed}: {plan_of(seed)}"
-
-
 # === random plans =============================================================================================
 #
 # Plans made at random, whose parts keep a record of their own of what happened to them.
