@@ -34,6 +34,7 @@ from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanag
 from contextvars import copy_context
 from dataclasses import replace
 from functools import partial, wraps
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, cast
@@ -64,22 +65,15 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.plan_writer import DelegatedWriter, WriterThread
 
 if TYPE_CHECKING:
-    from sqlalchemy import Select
-
-    from pycrorm_async.export.export import ExportComparison, Exported, FileFormat
-    from pycrorm_async.export.lerobot_images import ExportedImages
-    from pycrorm_async.export.scenes import Clock as StateClock
-    from pycrorm_async.export.selection import Exportable
+    from pycrorm_async.export import export as exporting
     from pycrorm_async.plan.language import ActionDescription, Designator
     from pycrorm_async.plan.task import TaskTreeNode
     from pycrorm_async.projections import Projection, UserView
     from pycrorm_async.query import Ask, AskedEpisode, Question, Reading, SyncQuestion
-    from pycrorm_async.query.picture import MomentReference
+    from pycrorm_async.query import picture as pictures
     from pycrorm_async.recall import Answer, Prediction, Recall
     from pycrorm_async.record import Episode
     from pycrorm_async.record.camera import CameraStream
-    from pycrorm_async.report import Report
-    from pycrorm_async.report.pictures import Images
 
 
 # === memory ===================================================================================================
@@ -484,10 +478,16 @@ class Memory:
         return self._open_parts.reading
 
     session = _reading(lambda: reading_side.Reading.session)
-    if TYPE_CHECKING:  # a lambda would lose the overloads
+    if TYPE_CHECKING:  # a lambda would lose the overloads, or load what most memories do not use
         dataframe = _as_read(Reading.dataframe)
+        export = _as_read(exporting.export)
+        export_again = _as_read(exporting.export_again)
+        picture = _as_read(pictures.picture)
     else:
         dataframe = _reading(lambda: reading_side.Reading.dataframe)
+        export = _reading(lambda: import_module("pycrorm_async.export.export").export)
+        export_again = _reading(lambda: import_module("pycrorm_async.export.export").export_again)
+        picture = _reading(lambda: import_module("pycrorm_async.query.picture").picture)
     batches = _reading(lambda: reading_side.Reading.batches)
     query = _reading(lambda: reading_side.Reading.query)
     mapped = _reading(lambda: reading_side.Reading.mapped)
@@ -500,6 +500,7 @@ class Memory:
     number_of = _reading(lambda: reading_side.Reading.number_of)
     plot_success = _reading(lambda: reading_side.plot_success)
     samples = _reading(lambda: reading_side.read_samples)
+    report = _reading(lambda: reporting.report)
 
     @property
     def ask(self) -> Ask[Question]:
@@ -555,72 +556,6 @@ class Memory:
                 yield
         finally:
             adviser_.close()
-
-    async def report(
-        self,
-        episode: AskedEpisode,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        force: bool = False,
-        first: int | None = None,
-        last: int | None = None,
-        images: Images = "thumbs",
-    ) -> Report:
-        """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
-        return await reporting.report(self.reading, episode, path, force=force, first=first, last=last, images=images)
-
-    async def picture(self, /, episode: AskedEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
-        """Return the scene of an episode at a moment as PNG, up to the last flush.
-
-        >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))
-
-        `view` are the size and the camera, see `pycrorm_async.query.picture.picture`. It needs the extra `world`.
-        """
-        from pycrorm_async.query.picture import picture  # loads a world, which most programs have no need of
-
-        return await picture(self.reading, episode, at=at, **view)
-
-    async def export(
-        self,
-        what: Exportable | SyncQuestion,
-        path: str | os.PathLike[str],
-        *,
-        file_format: FileFormat | None = None,
-        episodes: Sequence[str | int] = (),
-        force: bool = False,
-        arguments: Mapping[str, Any] = MappingProxyType({}),
-        clock: StateClock | None = None,
-        fps: int | None = None,
-        images: ExportedImages | None = None,
-    ) -> Exported:
-        """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
-        from pycrorm_async.export.export import export  # here, because most memories write no file
-
-        return await export(
-            self.reading,
-            what.question if isinstance(what, reading_side.SyncQuestion) else what,
-            path,
-            file_format=file_format,
-            episodes=episodes,
-            arguments=arguments,
-            force=force,
-            clock=clock,
-            fps=fps,
-            images=images,
-        )
-
-    async def export_again(
-        self,
-        manifest: str | os.PathLike[str],
-        path: str | os.PathLike[str] | None = None,
-        *,
-        statement: Question | Select[*tuple[Any, ...]] | None = None,
-        force: bool = False,
-    ) -> ExportComparison:
-        """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
-        from pycrorm_async.export.export import export_again
-
-        return await export_again(self.reading, manifest, path, statement=statement, force=force)
 
     # --- opening and closing ----------------------------------------------------------------------------------
 

@@ -39,7 +39,7 @@ from pycrorm_async.export.scenes import MCAP, Clock
 from pycrorm_async.export.traces import OTLP, TRACE
 from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
-from pycrorm_async.query.question import Question
+from pycrorm_async.query.question import Question, SyncQuestion
 from pycrorm_async.query.questions import QUESTIONS, Ask, arguments_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
@@ -179,7 +179,7 @@ async def export(
         refuse_existing(beside, force=force)
     options = _options(name, chosen, {"clock": clock, "fps": fps, "images": images, "no_formulas": no_formulas})
     is_of_rows, whole = chosen.holds == "rows", f"the format {name} holds whole episodes"
-    if not is_of_rows and (episodes or isinstance(what, type | Select | Question)):
+    if not is_of_rows and (episodes or isinstance(what, type | Select | Question | SyncQuestion)):
         raise CallerError(f"{whole}: name them by number, id or `last`")
     further = new_file(beside, force=force) if beside is not None else nullcontext()
     with new_file(selections.manifest_path(target), force=force) as description, further as unnamed_beside:

@@ -24,12 +24,12 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import Base, Designator, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import EPISODE, same_row, view_mappers
 from pycrorm_async.query.frames import of_episode
-from pycrorm_async.query.question import Question, episode_name
+from pycrorm_async.query.question import Question, SyncQuestion, episode_name
 from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
 
-Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Question | Select[*tuple[Any, ...]]"
+Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Question | SyncQuestion | Select[*tuple[Any, ...]]"
 """An episode or several, by number, id or `last`; a view, a table or a question by name; a mapped class; a question of
 `memory.ask`; a select."""
 
@@ -99,8 +99,9 @@ async def select_rows(
         if chosen:
             raise CallerError("a select of your own chooses its episodes itself: add a condition to it")
         return Selection("select", "", what, *await _covered(reading, ()))
-    if isinstance(what, Question):
-        return await _asked(reading, "select", what, {}, chosen)
+    if isinstance(what, Question | SyncQuestion):
+        question = what.question if isinstance(what, SyncQuestion) else what
+        return await _asked(reading, "select", question, {}, chosen)
     if isinstance(what, type):
         what = what.__name__
     names = [str(what)] if isinstance(what, str | int) else [str(each) for each in what]

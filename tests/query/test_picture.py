@@ -7,7 +7,7 @@ import io
 import json
 import struct
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ async def test_a_picture_frames_what_moves_and_a_focus_one_object(url: str) -> N
         assert redness(default) > 0.005
         assert redness(await memory.picture(1, focus="cube", width=160, height=120)) > 0.1
         assert redness(await memory.picture(1, focus="courier", yaw_deg=180, pitch_deg=5, width=90, height=120)) < 0.05
-        small = {"width": 64, "height": 48, "yaw_deg": 0.0}
+        small: dict[str, Any] = {"width": 64, "height": 48, "yaw_deg": 0.0}
         same = [await memory.picture(1, at=when, **small) for when in ("e7", "e7")]
         assert same[0] == same[1]
         async with memory.episode(description="Looking"):
