@@ -29,6 +29,7 @@ from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -391,6 +392,14 @@ async def stream(log: EventLog, sql: str, limits: SqlLimits = DEFAULT_LIMITS) ->
         cursors = _sqlite_cursor(log.address.path, sql, limits) if is_file else _server_cursor(log.engine, sql, limits)
         async with cursors as cursor:
             yield SqlRows(cursor, limits)
+
+
+class ReadOnlySql:
+    """`query` and `stream` on the database of one log, for programs of the previous release."""
+
+    def __init__(self, log: EventLog) -> None:
+        self.query = partial(query, log)
+        self.stream = partial(stream, log)
 
 
 # === refusals =================================================================================================
