@@ -115,6 +115,12 @@ def test_an_import_of_our_own_export_has_the_same_tree_statuses_times_and_poses(
         assert ask(after, query) == ask(before, query)
 
 
+def test_a_status_that_no_node_has_is_unknown(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text((source / "walk.trace").read_text().replace('"status":"ERROR"', '"status":"ODD"'))
+    [episode] = import_files("trace", [tmp_path / "t.json"], None).episodes
+    assert (episode.statuses["UNKNOWN"], "ODD" in episode.statuses) == (2, False)
+
+
 def test_whole_numbers_keep_each_digit_and_what_was_missing_stays_so(again: tuple[str, Path]) -> None:
     _, file = again
     stored = ask(file, "SELECT payload FROM event WHERE type = 'NodeStarted' AND episode = 2 ORDER BY sequence")
