@@ -82,7 +82,7 @@ class Projector:
                     if registered.get(name) != layout.user_views.get(name):  # new or changed by this caller
                         raise CallerError(f"the database refuses the view {name}: {reason}")
             self.runner = FoldRunner(self._target, batch_events=self._batch_events)
-            self.runner.companions = self._companions
+            self.runner.companions = lambda events: self._custom.companions(events, until_visible=self._until_visible)
             self.runner.generation = generation
             await sweep(self._log)
 
@@ -129,9 +129,6 @@ class Projector:
         """
         with self._log.translated():
             return await self._refresh() or await self._custom.fold_next_batch(share=share)
-
-    def _companions(self, events: int) -> Sequence[FoldRunner]:
-        return self._custom.companions(events, until_visible=self._until_visible)
 
     async def _refresh(self) -> bool:
         generation = self.runner.generation

@@ -123,13 +123,10 @@ class Rows:
         else:
             row.update(end._asdict())
         if end.status in LOSES_OPEN_NODES:
-            self._lose_nodes(end.id)
-
-    def _lose_nodes(self, number: int) -> None:
-        self.lost.append(number)
-        for row in self.nodes.values():
-            if row[_NODE_EPISODE] == number and row[STATUS] == "RUNNING":
-                row[STATUS] = "LOST"
+            self.lost.append(end.id)
+            for node in self.nodes.values():
+                if node[_NODE_EPISODE] == end.id and node[STATUS] == "RUNNING":
+                    node[STATUS] = "LOST"
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
         """Return all rows to insert, by (table, columns)."""
@@ -207,7 +204,10 @@ def pose_row(own: int, number: int, pose: PoseValue) -> Row:
 def scalar(field: FieldDeclared, kind: str, value: Any) -> Any:
     """Convert a value for a column of type `kind`. Raises `CannotFold` for a value of another type."""
     if kind == "datetime":
-        return _datetime_us(field, value)
+        try:
+            return (datetime.fromisoformat(value) - _EPOCH) // _MICROSECOND
+        except (TypeError, ValueError):
+            raise CannotFold(f"{field.name}: {_shortened(value)} is not of the declared type datetime") from None
     if not isinstance(value, _SCALARS[kind]) or (isinstance(value, bool) and kind != "boolean"):
         raise CannotFold(f"{field.name}: {_shortened(value)} is not of the declared type {kind}")
     return float(value) if isinstance(value, int) and kind == "real" else value
@@ -232,14 +232,6 @@ def object_of(field: FieldDeclared, value: Any) -> ObjectReference | ObjectValue
 def json_text(value: Any) -> str:
     """Encode a value as the JSON text of a column."""
     return msgspec.json.encode(value).decode()
-
-
-def _datetime_us(field: FieldDeclared, value: Any) -> int:
-    try:
-        moment = datetime.fromisoformat(value)
-        return (moment - _EPOCH) // _MICROSECOND
-    except (TypeError, ValueError):
-        raise CannotFold(f"{field.name}: {_shortened(value)} is not of the declared type datetime") from None
 
 
 def _shortened(value: Any) -> str:
@@ -423,13 +415,10 @@ def _entry(event: StoredEvent, field: FieldDeclared, value: Any) -> Row:
     if item == "pose":
         return (*scalars, *pose_columns(pose_of(field, value)), None, None, None)
     if item == "object":
-        return (*scalars, *_object_entry(event, object_of(field, value)))
+        entry = object_of(field, value)
+        if isinstance(entry, ObjectReference):
+            return (*scalars, *_NO_POSE, row_of(event.number, entry.row), None, None)
+        pose = pose_columns(entry.pose) if entry.pose is not None else _NO_POSE
+        return (*scalars, *pose, None, entry.name, entry.object_type)
     scalars[_ITEM_SCALARS[item]] = scalar(field, item, value)
     return (*scalars, *_NO_POSE, None, None, None)
-
-
-def _object_entry(event: StoredEvent, value: ObjectReference | ObjectValue) -> Row:
-    if isinstance(value, ObjectReference):
-        return (*_NO_POSE, row_of(event.number, value.row), None, None)
-    pose = pose_columns(value.pose) if value.pose is not None else _NO_POSE
-    return (*pose, None, value.name, value.object_type)

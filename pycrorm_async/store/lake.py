@@ -186,7 +186,8 @@ def _prepare(connection: Any, *, write: bool) -> str | None:
             connection.execute(f"INSERT INTO pycrorm_lake VALUES ({_FORMAT})")
         connection.execute("COMMIT")
         connection.execute("CALL lake.set_option('parquet_compression', 'zstd')")
-    if "erased" not in missing and "reason" not in _columns_of_erased(connection):  # an earlier lake
+    described = [] if "erased" in missing else connection.execute("DESCRIBE lake.erased").fetchall()
+    if described and "reason" not in {name for name, *_ in described}:  # an earlier lake
         if write:
             connection.execute("ALTER TABLE erased ADD COLUMN reason VARCHAR")
         else:
@@ -195,10 +196,6 @@ def _prepare(connection: Any, *, write: bool) -> str | None:
         connection.execute(f"CREATE TEMP TABLE erased ({_TABLES['erased']})")
     [(number,)] = connection.execute("SELECT max(format) FROM pycrorm_lake").fetchall()
     return f"was made by a newer version: its format is {number}, this reads {_FORMAT}" if number > _FORMAT else None
-
-
-def _columns_of_erased(connection: Any) -> list[str]:
-    return [name for name, *_ in connection.execute("DESCRIBE lake.erased").fetchall()]
 
 
 def shown(address: str) -> str:
