@@ -150,7 +150,9 @@ class LogFollower:
                     changed, self.fault = False, str(error)
                     self._is_lost = self._replica is not None
                 if changed or fault != self.fault:
-                    await self._wake()
+                    async with self._changed:
+                        self.turn += 1
+                        self._changed.notify_all()
                 await asyncio.sleep(_INTERVAL_S if self.fault is None else _RETRY_S)
         finally:
             await self.close()
@@ -232,11 +234,6 @@ class LogFollower:
         except TimeoutError:
             return False
         return True
-
-    async def _wake(self) -> None:
-        async with self._changed:
-            self.turn += 1
-            self._changed.notify_all()
 
     async def _take_turn(self) -> bool:
         """Fold the events stored since the last turn; return whether there were any."""

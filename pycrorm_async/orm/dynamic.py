@@ -232,7 +232,9 @@ class DynamicClasses:
 
     def _add_field(self, class_: type[Designator], field: FieldDeclared) -> None:
         if field.type in ("list", "dict"):
-            setattr(class_, field.name, _entries(field))
+            # A field may have the names of these methods itself.
+            read = Designator.mapping if field.type == "dict" else Designator.entries
+            setattr(class_, field.name, property(lambda designator: read(designator, field.name)))
             return
         mapper = class_.__mapper__
         table = mapper.local_table
@@ -267,9 +269,3 @@ def _use_in_own_engine(state: ORMExecuteState) -> None:
             engine = state.session.get_bind(mapper).engine
             if not known_classes(engine.dialect).own:  # else it is the engine of a memory, or known already
                 classes.use_in(engine)
-
-
-def _entries(field: FieldDeclared) -> property:
-    """Return a property with the values of a list field, or of a dict field by key."""
-    read = Designator.mapping if field.type == "dict" else Designator.entries  # a field may have these names itself
-    return property(lambda designator: read(designator, field.name))

@@ -182,13 +182,10 @@ def _picture(picture: ObservedPicture) -> str:
 
 
 def _line(node: NodeSummary) -> str:
-    counts = counts_text(node), *(f"{number} {noun}s" for number, noun in _made_at(node) if number)
+    made = (node.observations, "observations"), (len(node.thoughts), "simulations")
+    counts = counts_text(node), *(f"{number} {noun}" for number, noun in made if number)
     words = " ".join(filter(None, (texts.node_text(node), *counts)))
     return f"{status(node.status, with_name=False)} {texts.recorded(words)}"
-
-
-def _made_at(node: NodeSummary) -> tuple[tuple[int, str], ...]:
-    return (node.observations, "observation"), (len(node.thoughts), "simulation")
 
 
 # === gantt ====================================================================================================
@@ -417,7 +414,7 @@ def moment_html(then: Moment) -> str:
     running = " → ".join(f"<b>{texts.recorded(each.dtype or each.kind)}</b>" for each in then.running)
     seen = list(then.observations.items())
     rows = [
-        (texts.recorded(name, 40), texts.recorded(_json(each.values)), f"e{each.sequence}")
+        (texts.recorded(name, 40), texts.recorded(msgspec.json.encode(each.values).decode()), f"e{each.sequence}")
         for name, each in seen[:_ROWS_MAX]
     ]
     observed = [texts.table(("observation", "values", "event"), rows), _omitted(len(seen))] if seen else []
@@ -442,7 +439,3 @@ def _object_row(each: ObjectThen) -> Sequence[str]:
     position = (f"{value:.3f}" for value in each.pose.position)
     heading = f"{round(math.degrees(each.pose.yaw)) + 0}°"
     return texts.recorded(each.name, 40), texts.recorded(each.object_type), *position, heading, attached
-
-
-def _json(values: object) -> str:
-    return msgspec.json.encode(values).decode()

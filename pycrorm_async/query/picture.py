@@ -9,10 +9,10 @@ from collections.abc import Collection, Sequence
 from contextvars import Context
 from dataclasses import replace
 from datetime import datetime
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from sqlalchemy import Select, func, select
+from sqlalchemy import func, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_key
@@ -84,8 +84,10 @@ async def picture(
         raise CallerError(await _emptiness(reading, then))
     if focus is not None:
         then.world.object(focus)
-    async with reading.session() as session:
-        moved = {focus} if focus is not None else set((await session.scalars(_moving(then.number))).all())
+    of_world = ObjectRow.process_metadata_id == then.number, ObjectRow.identity_id.is_not(None)
+    each_object = select(ObjectRow.name).where(*of_world).group_by(ObjectRow.name, ObjectRow.identity_id)
+    moving = await reading.rows(each_object.having(func.count() > 1))
+    moved = {focus} if focus is not None else {name for (name,) in moving}
     return await asyncio.to_thread(Context().run, _drawn, then, moved, (width, height), yaw_deg, pitch_deg)
 
 
@@ -113,14 +115,6 @@ async def _emptiness(reading: Reading, then: Moment) -> str:
         return f"episode {then.number} has no objects to draw: no world was recorded"
     begin = f"its first object was added at event {row_key(added).sequence}"
     return f"the world of episode {then.number} was empty at event {then.sequence}, so nothing is drawn; {begin}"
-
-
-def _moving(number: int) -> Select[Any]:
-    """Select the names of the objects with more than one pose in the episode."""
-    of_world = ObjectRow.process_metadata_id == number, ObjectRow.identity_id.is_not(None)
-    return (
-        select(ObjectRow.name).where(*of_world).group_by(ObjectRow.name, ObjectRow.identity_id).having(func.count() > 1)
-    )
 
 
 def _drawn(

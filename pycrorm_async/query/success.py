@@ -115,6 +115,8 @@ def _percent(*rates: float) -> str:
 
 
 def _draw_cells(axes: Axes, table: SuccessTable) -> None:
+    from matplotlib.patches import Rectangle
+
     rates = np.full((table.y.cells, table.x.cells), np.nan)
     for cell in table.cells:
         rates[cell.y, cell.x] = cell.rate
@@ -124,11 +126,11 @@ def _draw_cells(axes: Axes, table: SuccessTable) -> None:
     figure.colorbar(mesh, ax=axes, shrink=0.8, label="share of successes; hatched: fewer than 5 rows")
     cells_drawn = table.x.cells * table.y.cells
     for cell in table.cells:
-        dark = cell.rate < 0.6
+        color = "white" if cell.rate < 0.6 else "black"
         if cell.rows < _FEW:
-            axes.add_patch(_hatched(cell, "white" if dark else "black"))
+            place = cell.x, cell.y
+            axes.add_patch(Rectangle(place, 1, 1, fill=False, hatch="///", edgecolor=color, linewidth=0, alpha=0.3))
         if text := _text(cell, cells_drawn):
-            color = "white" if dark else "black"
             size = 9 if cells_drawn <= _CELLS_WITH_INTERVAL else 7 if cells_drawn <= _CELLS_WITH_COUNT / 2 else 5.5
             axes.text(cell.x + 0.5, cell.y + 0.5, text, ha="center", va="center", color=color, fontsize=size)
     _ticks(axes.xaxis, table.x)
@@ -137,12 +139,6 @@ def _draw_cells(axes: Axes, table: SuccessTable) -> None:
         axes.set_aspect("equal")
     if table.x.labels and max(map(len, table.x.labels)) * table.x.cells > 70:
         axes.tick_params(axis="x", rotation=45)
-
-
-def _hatched(cell: Cell, color: str) -> Any:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((cell.x, cell.y), 1, 1, fill=False, hatch="///", edgecolor=color, linewidth=0, alpha=0.3)
 
 
 def _text(cell: Cell, cells_drawn: int) -> str:

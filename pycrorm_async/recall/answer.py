@@ -156,7 +156,12 @@ class RecalledCase:
 
     def difference(self) -> str:
         """Return the features that are not quite alike, with the values of the case, as text."""
-        return "; ".join(_missed(each) for each in self.compared if each.similarity < 1)
+        return "; ".join(
+            f"{each.feature} {value_text(each.found)}"
+            + ("" if each.difference is None else f" ({each.difference:.3g} off)")
+            for each in self.compared
+            if each.similarity < 1
+        )
 
     async def next(self) -> Case | None:
         """Return the action that started next under the same parent."""
@@ -352,9 +357,10 @@ def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:
     """Return each feature of the cue beside that of a case."""
     whole = weights.total
     words = [
-        Compared(feature, wanted, value, None, None, float(_has(value, wanted)), weight / whole)
+        Compared(feature, wanted, value, None, None, float(has), weight / whole)
         for (feature, wanted), weight in zip(cue.has, weights.words, strict=True)
         for value in [_value_of(case, feature)]
+        for has in [wanted in value if isinstance(value, tuple) else value == wanted]
     ]
     numbers = []
     for wanted, tolerance in zip(cue.near, weights.tolerances, strict=True):
@@ -407,15 +413,6 @@ def _value_of(case: Case, feature: str) -> str | tuple[str, ...] | float | None:
             return case.duration_s
     value = case.symbols.get(feature)
     return case.numbers.get(feature) if value is None else value
-
-
-def _has(value: object, word: str) -> bool:
-    return word in value if isinstance(value, tuple) else value == word
-
-
-def _missed(compared: Compared) -> str:
-    off = "" if compared.difference is None else f" ({compared.difference:.3g} off)"
-    return f"{compared.feature} {value_text(compared.found)}{off}"
 
 
 def value_text(value: str | tuple[str, ...] | float | None) -> str:

@@ -171,12 +171,7 @@ def best_first(tries: Tries, *, height: float | None = None, torso: float | None
     """
     prior = (int(tries.succeeded.sum()) + 1) / (tries.succeeded.size + 2)
     ways = [way for rows in _alike(tries) for way in _scored(tries, rows, height, torso, prior)]
-    return [way for _, way in sorted(ways, key=_order)]
-
-
-def _order(item: tuple[int, PastSuccess]) -> tuple[float, int, int]:
-    row, way = item
-    return -way.score, -way.times, row
+    return [way for row, way in sorted(ways, key=lambda each: (-each[1].score, -each[1].times, each[0]))]
 
 
 def _alike(tries: Tries) -> Iterator[NDArray[np.int64]]:

@@ -92,19 +92,15 @@ class ProcessCases:
             episode, sequence, happening, _ = event
             running = self._episodes.get(episode)
             if running is None and sequence == 1:
-                running = self._begin(episode)
+                self._own_numbers += 1
+                running = _Running(episode, EPISODE_NUMBER_MAX + 1 - self._own_numbers, is_numbered=False)
+                self._episodes[episode] = running
             if running is not None and sequence > running.reached and not running.has_ended:
                 kind, payload = type(happening), encode(happening)
                 identity = running.number, sequence, kind.__name__, kind.version
                 running.unnumbered += self._read(running, [StoredEvent(*identity, wall_ns, monotonic_ns, payload)])
         cases += await self._numbered()
         return cases, [case for each in self._episodes.values() for case in each.unnumbered]
-
-    def _begin(self, episode: str) -> _Running:
-        self._own_numbers += 1
-        running = _Running(episode, EPISODE_NUMBER_MAX + 1 - self._own_numbers, is_numbered=False)
-        self._episodes[episode] = running
-        return running
 
     async def _read_open(self) -> list[Case]:
         """Fold the earlier events of the open episodes; cases that are in the tables too are returned again."""

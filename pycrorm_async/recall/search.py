@@ -568,17 +568,12 @@ def _numbers_of_ways(groups: Sequence[Group], library: CaseLibrary) -> NDArray[n
         column = joined([group.texts.get(name) for group in groups], sizes, library.words(name))
         different = len(column.words) + 1
         if count > _NUMBERS_MAX // different:
-            ways, count = _renumbered(ways)
+            kept, numbers = np.unique(ways, return_inverse=True)
+            ways, count = numbers.astype(np.int64), int(kept.size)
         ways *= different
         ways += column.values
         count *= different
     return ways
-
-
-def _renumbered(ways: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the ways numbered from 0 on, and the number of different ones."""
-    different, numbers = np.unique(ways, return_inverse=True)
-    return numbers.astype(np.int64), int(different.size)
 
 
 def _spread_evenly(

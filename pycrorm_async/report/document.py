@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 from base64 import b64encode
 from bisect import bisect_right
-from collections.abc import AsyncIterable, Iterable, Mapping, Reversible, Sequence
+from collections.abc import AsyncIterable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import islice, takewhile
@@ -155,6 +155,8 @@ class EpisodePage(EpisodeReplay):
         observed behind it.
         """
         begin = max(after + 1 - self._first, 0)
+        started = [*takewhile(lambda each: each[0] > after, reversed(self._rows.values()))][::-1]
+        ended = [self._rows[start] for start in self._ended_since(after)]
         return {
             "format": 1,
             "after": after,
@@ -163,8 +165,8 @@ class EpisodePage(EpisodeReplay):
             "texts": self._texts.cut(
                 _TEXTS_CHARACTERS, shortest=_TEXT_SHORTEST, longest=_TEXT_LONGEST, after=after or -1
             ),
-            "nodes": _columns(_newest(self._rows.values(), after), 12),
-            "ended": _columns([self._end_of(start) for start in self._ended_since(after)], 6),
+            "nodes": _columns(started, 12),
+            "ended": _columns([[*row[:2], *row[6:9], row[11]] for row in ended], 6),
             "models": dict(models),
             "objects": [
                 each for each in (self._object(identity, models, after) for identity in self.tracks.objects) if each
@@ -213,10 +215,6 @@ class EpisodePage(EpisodeReplay):
         newest = takewhile(lambda start: self._ended_nodes[start] > after, reversed(self._ended_nodes))
         return [start for start in newest if start <= after][::-1]
 
-    def _end_of(self, start: int) -> list[int]:
-        row = self._rows[start]
-        return [*row[:2], *row[6:9], row[11]]
-
     def _object(self, identity: int, models: Mapping[str, Any], after: int) -> dict[str, Any] | None:
         """Return an object, or its identity with what changed behind event `after`; None if nothing did."""
         each, added = self.tracks.objects[identity], self.world.added[identity]
@@ -242,11 +240,6 @@ class EpisodePage(EpisodeReplay):
 def model_name(added: event_types.ObjectAdded) -> str:
     """Return the name of an object's model: its fingerprint, or for an assumed one what the assumption rests on."""
     return added.description or f"{added.object_type} {added.name}"
-
-
-def _newest(rows: Reversible[list[int]], after: int) -> list[list[int]]:
-    """Return the nodes that started behind event `after`, in their order."""
-    return list(takewhile(lambda each: each[0] > after, reversed(rows)))[::-1]
 
 
 def _columns(rows: Sequence[Sequence[Any]], width: int) -> list[list[Any]]:

@@ -31,7 +31,6 @@ from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import Answer, Compared, RecalledCase, answer, value_text
 from pycrorm_async.recall.blocks import CaseLibrary, Group
-from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource, cue_like
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.output_files import refuse_existing, write_file
@@ -247,7 +246,8 @@ class SimilarCases:
         texts: dict[str, int] = {}
         for group, row in cases[: self._actions_max(len(library))]:
             case = group.case(row)
-            nodes[str(case.sequence)] = _entry(_earlier(case, library), texts)
+            earlier = replace(cue_like(case, library), before_us=case.started_us, k=COUNTED)
+            nodes[str(case.sequence)] = _entry(answer(earlier, library), texts)
         mentioned = {each[0] for entry in nodes.values() for each in entry["cases"]}
         pages = {str(each): page_name(each) for each in sorted(mentioned & self._pages - {episode})}
         return {"actions": len(cases), "pages": pages, "texts": [*texts], "nodes": nodes}
@@ -268,11 +268,6 @@ def _cases_of(library: CaseLibrary, episode: int, starts: Collection[int]) -> li
         status = group.texts["status"].value
         entries += [(status(row) not in _FAILED_STATUSES, int(group.nodes[row]), group, row) for row in rows.tolist()]
     return [(group, row) for _, _, group, row in sorted(entries, key=lambda each: each[:2])]
-
-
-def _earlier(case: Case, library: CaseLibrary) -> Answer:
-    """Return the cases most like this one that started before it."""
-    return answer(replace(cue_like(case, library), before_us=case.started_us, k=COUNTED), library)
 
 
 def _entry(similar: Answer, texts: dict[str, int]) -> dict[str, Any]:
