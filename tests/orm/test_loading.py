@@ -152,11 +152,7 @@ async def test_a_database_that_is_away_is_named_when_an_attribute_is_read(
 #
 # Every attribute of an object from a query is loaded, or reading it raises an error that names the remedy.
 
-CLASSES = [
-    each.class_
-    for each in sorted(orm.Base.registry.mappers, key=str)
-    if each.class_.__module__.startswith("pycrorm_async.orm")
-]
+CLASSES = [getattr(orm, name) for name in orm.__all__ if name != "Base"]
 ON_REQUEST = {"children", "ancestors", "node", "parameters", "refusals", "description", "robots", "outcome"}
 ON_REQUEST_OF_PICK_UPS = {"object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso"}
 ON_REQUEST_OF_PICK_UPS |= {f"robot_in_{name}" for name in ON_REQUEST_OF_PICK_UPS if name != "height_over_torso"}
