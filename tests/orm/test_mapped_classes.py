@@ -10,25 +10,11 @@ import msgspec
 import pytest
 from sqlalchemy import Table, inspect, select
 
-import pycrorm_async.orm
+from pycrorm_async import orm, plan
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded
 from pycrorm_async.orm import Action, Concept, ConceptAncestor, Designator, Language, Motion, Object, PickUpAction
-from pycrorm_async.plan import (
-    ActionAbstract,
-    BaseMotion,
-    Code,
-    Monitor,
-    Parallel,
-    Repeat,
-    Retry,
-    Sequential,
-    TryAll,
-    TryInOrder,
-    actions,
-    motions,
-)
 from pycrorm_async.projections.columns import Layout
 from pycrorm_async.projections.mapped_tables import mapped_leaves
 from pycrorm_async.query.reading import Reading
@@ -43,22 +29,33 @@ from tests.projections.sql_queries import stored_and_folded
 #
 # The shipped mapped classes agree with the shipped designators, field by field.
 
-MODULES = (actions, motions)
+MODULES = (plan.actions, plan.motions)
 PERFORMABLES = [
     each
     for module in MODULES
     for each in vars(module).values()
-    if isinstance(each, type) and issubclass(each, ActionAbstract | BaseMotion) and each.__module__ == module.__name__
+    if isinstance(each, type)
+    and issubclass(each, plan.ActionAbstract | plan.BaseMotion)
+    and each.__module__ == module.__name__
     if not isabstract(each)
 ]
-EXPRESSIONS = [Sequential, TryInOrder, Parallel, TryAll, Repeat, Monitor, Code, Retry]
+EXPRESSIONS = [
+    plan.Sequential,
+    plan.TryInOrder,
+    plan.Parallel,
+    plan.TryAll,
+    plan.Repeat,
+    plan.Monitor,
+    plan.Code,
+    plan.Retry,
+]
 ROOTS = {"action": Action, "motion": Motion, "language": Language}
 
 
 @pytest.mark.parametrize("designator", [*PERFORMABLES, *EXPRESSIONS], ids=lambda each: each.__name__)
 def test_every_designator_has_a_mapped_class_into_whose_table_it_fits(designator: type) -> None:
     declaration = declared_type(designator).declaration
-    mapped = getattr(pycrorm_async.orm, declaration.dtype)
+    mapped = getattr(orm, declaration.dtype)
     assert issubclass(mapped, ROOTS[declaration.kind])
     assert mapped.__tablename__ == declaration.table
     table = inspect(mapped).local_table
@@ -88,7 +85,12 @@ def test_every_name_of_the_thesis_exists() -> None:
         " OpeningMotion WorldStateDetectingMotion"
     )
     for name in table_4_1.split():
-        assert issubclass(getattr(pycrorm_async.orm, name), Designator), name
+        assert issubclass(getattr(orm, name), Designator), name
+
+
+def test_a_row_of_an_episode_begins_with_its_id_and_its_episode() -> None:
+    for class_ in (orm.Pose, orm.Attachment):
+        assert [each.name for each in class_.__table__.columns][:2] == ["id", "process_metadata_id"], class_
 
 
 # === concepts =================================================================================================
@@ -115,7 +117,7 @@ def recorded_types(base: Any) -> Iterator[Any]:
 
 
 def test_every_concept_of_the_built_in_types_has_its_superclasses() -> None:
-    types = (*recorded_types(ActionAbstract), *recorded_types(BaseMotion))
+    types = (*recorded_types(plan.ActionAbstract), *recorded_types(plan.BaseMotion))
     used = {each.concept for each in types if each.__module__.startswith("pycrorm_async.")}
     assert used - {None} <= CONCEPTS.keys()
     assert {each.name for each in ObjectType} == CONCEPT_OF_OBJECT_TYPE.keys()

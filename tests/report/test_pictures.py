@@ -8,6 +8,7 @@ import pytest
 
 from pycrorm_async.events.types import Blob
 from pycrorm_async.memory import Memory
+from pycrorm_async.query import observed_images
 from pycrorm_async.query.observed_images import png_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.document import episode_document
@@ -52,7 +53,9 @@ async def document_of(url: str, images: Images) -> dict[str, Any]:
         return await episode_document(reading, "last", images=images)
 
 
-async def test_a_document_has_pictures_once_and_the_reasons_of_those_that_are_none(url: str) -> None:
+async def test_a_document_has_pictures_once_and_the_reasons_of_those_that_are_none(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("PIL")
     observe(url, 2)
     document = await document_of(url, "thumbs")
@@ -74,6 +77,9 @@ async def test_a_document_has_pictures_once_and_the_reasons_of_those_that_are_no
     whole = await document_of(url, "full")
     assert [each.get("text") for each in whole["pictures"]][:3] == ["whole", "whole", "whole, 0.5 to 2"]
     assert whole["contents"][0].startswith("data:image/png;base64,")
+    monkeypatch.setattr(observed_images, "_CONTENT_MAX", 999)
+    faults = [each.get("fault") for each in (await document_of(url, "thumbs"))["pictures"]]
+    assert faults.count("it has 108,128 bytes, more than 999") == 1
 
 
 @pytest.mark.slow
