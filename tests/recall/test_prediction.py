@@ -354,6 +354,8 @@ async def test_what_is_no_action_and_a_minimum_that_is_no_chance_are_refused() -
     async with Memory.open("sqlite://") as memory:
         with pytest.raises(CallerError, match="3 is no action: give one"):
             await memory.predict(3)  # type: ignore[arg-type]
+        with pytest.raises(CallerError, match="`has` and `near` belong to a type"):
+            await memory.recall.predict(GripSliding([1.5]), near={"level": 1.5})
         with pytest.raises(CallerError, match="minimum must be a chance from 0 to 1, got 30"), memory.advising(30):
             pass
 
