@@ -274,6 +274,22 @@ def test_an_event_that_cannot_be_folded_names_the_reason_and_leaves_no_row(event
     assert rows.node_ends == []
 
 
+@pytest.mark.parametrize(
+    ("type_", "payload", "version", "reason"),
+    [
+        ("RobotDanced", b"{}", 1, "RobotDanced is not an event type of this version"),
+        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 4, "NodeEnded has version 4, this version reads 3"),
+        ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
+    ],
+)
+def test_an_event_of_an_unknown_version_cannot_be_folded(type_: str, payload: bytes, version: int, reason: str) -> None:
+    script = Script()
+    script.put_payload(type_, payload, version)
+    with pytest.raises(CannotFold) as raised:
+        fold(script.stored()[0], Designators(), Rows())
+    assert str(raised.value) == reason
+
+
 def test_a_dict_field_may_contain_the_key_missing_among_others() -> None:
     notes = declared("NoteAction", "note_action", field("notes", "dict", 2, item="text"))
     script = Script()
