@@ -6,12 +6,8 @@ import contextlib
 import gzip
 import json
 import math
-import os
 import random
 import re
-import signal
-import subprocess
-import time
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -25,7 +21,7 @@ from pycrorm_async.imports import intake
 from pycrorm_async.imports.registry import import_files
 from pycrorm_async.memory import SyncMemory
 from pycrorm_async.world.pose import Pose
-from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, put_memory
 from tests.imports.importing import imported, poses, tree
 from tests.record.recordings import AT_END, assert_verified
@@ -303,27 +299,6 @@ def test_the_same_file_twice_is_stored_once_and_another_name_in_the_map_stores_i
     (tmp_path / "map.toml").write_text('name = "second"')
     imported(tmp_path, "trace", tmp_path / "t.json", map_file=tmp_path / "map.toml")
     assert ask(tmp_path / "memory.db", "SELECT count(*) FROM process_metadata") == [(2,)]
-
-
-@pytest.mark.slow
-def test_an_import_that_is_killed_and_started_again_doubles_nothing_and_misses_nothing(tmp_path: Path) -> None:
-    events = [{"ph": "X", "name": "Drive", "ts": n * 10, "dur": 5, "args": {"n": n}} for n in range(30_000)]
-    (tmp_path / "t.json").write_text(trace_of(*events))
-    command = [*COMMAND, "import", "trace", "t.json", "--url", "sqlite:///memory.db"]
-    for _ in range(2):
-        with subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.DEVNULL) as started:
-            segments = tmp_path / "memory.db.spool"
-            while not any(each.stat().st_size for each in segments.rglob("*.segment")) and started.poll() is None:
-                time.sleep(0.01)
-            time.sleep(0.3)
-            os.kill(started.pid, signal.SIGKILL)
-    done = pycrorm("import", "trace", "t.json", "--url", "sqlite:///memory.db", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    [episode] = json.loads(done.stdout)["episodes"]
-    assert (episode["state"], episode["nodes"]) == ("imported", 30_000)
-    numbers = ask(tmp_path / "memory.db", "SELECT n FROM drive ORDER BY id")
-    assert [int(n) for (n,) in numbers] == list(range(30_000))
-    assert ask(tmp_path / "memory.db", "SELECT status FROM process_metadata") == [("UNKNOWN",)]
 
 
 @pytest.mark.parametrize(
