@@ -55,8 +55,9 @@ async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_on
     backoff = Backoff(first_s=0.005, longest_s=0.02)
     drain = Drain(source, log.append, settings=Settings(batch_events_max=50), backoff=backoff)
     running = asyncio.create_task(drain.run())
-    while drain.state.retries < 5:  # noqa: ASYNC110
+    while drain.state.retries < 5 and not running.done():  # noqa: ASYNC110
         await asyncio.sleep(0.001)
+    assert not running.done(), "the drain ended instead of waiting for space"
     assert "database or disk is full" in (drain.state.unavailable or "")
     assert 0 < len(source.kept) < 1000
     with pytest.raises(DatabaseUnavailable, match="full"):
