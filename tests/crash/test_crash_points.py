@@ -24,7 +24,18 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from tests.databases import ask
-from tests.queue.factories import RECORDER, SMALL, STILL, FolderWriter, drain, ended, episode, node, started
+from tests.queue.factories import (
+    RECORDER,
+    SMALL,
+    STILL,
+    FolderWriter,
+    drain,
+    ended,
+    episode,
+    node,
+    opened_dead,
+    started,
+)
 
 # === crash points =============================================================================================
 #
@@ -272,8 +283,7 @@ def dead_letter(spool: Path) -> list[Record]:
     if not folders:
         return []
     [folder] = folders
-    recovered = open_dead(folder.path)
-    assert recovered is not None
+    recovered = opened_dead(folder.path)
     records = asyncio.run(drain(recovered))
     recovered.release()
     assert {each.episode for each in records} == {episode(1)}

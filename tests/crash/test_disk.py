@@ -18,7 +18,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.codec import Record, is_computed_end
 from pycrorm_async.events.types import references_in
-from pycrorm_async.queue import RecorderQueue, open_dead
+from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.queue.blobs import is_whole
 from pycrorm_async.queue.format import EVENT, Segment, salt_of, sync_path
 from pycrorm_async.settings import Settings
@@ -39,6 +39,7 @@ from tests.queue.factories import (
     lost,
     make,
     node,
+    opened_dead,
     overwrite,
     record,
     recover,
@@ -376,8 +377,7 @@ async def test_what_a_recovery_supplied_after_a_kill_is_supplied_again_after_a_p
 
     whole = [*machine.put_so_far, *ends_of(machine.put_so_far)]
     monkeypatch.setattr(os, "fdatasync", watched)
-    recovered = open_dead(killed)
-    assert recovered is not None
+    recovered = opened_dead(killed)
     batch = await recovered.get_batch(events_max=rng.randrange(1, len(whole) + 1), bytes_max=2**20, age_s_max=0.0)
     assert batch == whole[: len(batch)]
     stored = rng.randrange(len(batch) + 1)

@@ -20,7 +20,6 @@ import pytest
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import LOST, Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.queue import open_dead
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -28,6 +27,7 @@ from pycrorm_async.writer.drain import Backoff, Drain
 from tests.crash.disk_machine import Machine, machine_on
 from tests.crash.step_robot import Event, verify_kept
 from tests.databases import ask
+from tests.queue.factories import opened_dead
 from tests.writer.fakes import CountingFold, ForwardingDestination
 
 pytestmark = pytest.mark.slow
@@ -143,8 +143,7 @@ async def _step(machine: Machine, life: _Life, destination: _FaultyLog, rng: ran
 async def _drain(folder: Path, log: EventLog, rng: random.Random) -> None:
     """Drain the dead folder as the next process would; cancel the drain and restart it at random."""
     for attempt in range(30):
-        recovered = open_dead(folder, check=rng.random() < 0.5)
-        assert recovered is not None
+        recovered = opened_dead(folder, check=rng.random() < 0.5)
         settings = Settings(batch_events_max=rng.choice((1, 5, 100)))
         drain = Drain(recovered, _FaultyLog(log, rng).append, settings=settings, backoff=_NO_BACKOFF)
         running = asyncio.create_task(drain.run())

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import SpoolFull
@@ -106,10 +107,16 @@ async def drain(queue: RecorderQueue | DeadSource | LiveSource, *, events_max: i
     return records
 
 
+def opened_dead(folder: Path, **options: Any) -> DeadSource:
+    """Open a dead folder that no other process has; the options are those of `open_dead`."""
+    source = open_dead(folder, **options)
+    assert source is not None
+    return source
+
+
 async def recover(folder: Path) -> list[Record]:
     """Return all records that recovery supplies, and leave the folder as it is."""
-    recovered = open_dead(folder)
-    assert recovered is not None
+    recovered = opened_dead(folder)
     try:
         return await drain(recovered)
     finally:

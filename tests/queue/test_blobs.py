@@ -13,7 +13,7 @@ import pytest
 
 from pycrorm_async.errors import SpoolClosed, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.codec import Heading
-from pycrorm_async.queue import RecorderQueue, Spool, open_dead
+from pycrorm_async.queue import RecorderQueue, Spool
 from pycrorm_async.queue.blobs import blob_files, read_blob
 from pycrorm_async.queue.format import Segment
 from pycrorm_async.queue.maintenance import inspect_spool, repair_folder
@@ -28,6 +28,7 @@ from tests.queue.factories import (
     eventually,
     make,
     node,
+    opened_dead,
     overwrite,
     started,
 )
@@ -191,8 +192,7 @@ async def test_a_killed_recorders_blobs_are_kept_with_its_last_segment(bound: Pa
     left = crashed_copy(queue, tmp_path / "left")
     queue.put_nowait(ended(), b"{}")
     queue.release()
-    source = open_dead(left, stored=queue._stored_segments)
-    assert source is not None
+    source = opened_dead(left, stored=queue._stored_segments)
     records = await drain(source)
     assert [each.type for each in records] == ["EpisodeStarted", "Observed", "EpisodeEnded"]
     assert read_blob(left.parent, NAME) == IMAGE
@@ -218,8 +218,7 @@ async def test_an_unsynced_record_whose_blob_a_power_cut_took_belongs_to_the_tor
         blob.write_bytes(b"")
     elif spoiled == "zeros":
         blob.write_bytes(bytes(len(IMAGE)))
-    source = open_dead(left)
-    assert source is not None
+    source = opened_dead(left)
     types = [each.type for each in await drain(source)]
     source.release()
     whole = ["EpisodeStarted", "NodeStarted", "Observed", "NodeStarted", "EpisodeEnded"]
@@ -233,8 +232,7 @@ async def test_a_synced_record_stays_although_its_blob_was_deleted(unsynced: Rec
     await unsynced.synced_to()
     left = crashed_copy(unsynced, tmp_path / "left")
     (left / "blobs" / NAME).unlink()
-    source = open_dead(left)
-    assert source is not None
+    source = opened_dead(left)
     assert [each.type for each in await drain(source)] == ["EpisodeStarted", "Observed", "EpisodeEnded"]
     source.release()
 

@@ -23,6 +23,7 @@ from tests.queue.factories import (
     episode,
     lost,
     node,
+    opened_dead,
     overwrite,
     record,
     recover,
@@ -158,8 +159,7 @@ async def test_records_that_are_refused_again_stay_in_place_and_stored_ones_are_
     put(own, some(5, 7))
     put(own, some(8, 9))
     shutil.rmtree(own)
-    recovered = open_dead(kept_in(own))
-    assert recovered is not None
+    recovered = opened_dead(kept_in(own))
     assert await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0) == [
         *placed(some(5, 9)),
         lost(6, 1, 10),
@@ -178,13 +178,11 @@ async def test_a_dead_recorders_refused_events_and_computed_end_become_dead_lett
     for heading in (DECLARED, started(1), node(1), node(1)):
         author.put(heading)
     for _ in range(2):  # a kill after the first recovery
-        recovered = open_dead(author.folder)
-        assert recovered is not None
+        recovered = opened_dead(author.folder)
         batch = await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
         assert recovered.dead_letter([each for each in batch if each.episode is not None]) is True
         recovered.release()
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     batch = await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
     await recovered.acknowledge(batch[-1].position)
     recovered.release()

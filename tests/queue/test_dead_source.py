@@ -29,6 +29,7 @@ from tests.queue.factories import (
     lost,
     make,
     node,
+    opened_dead,
     overwrite,
     recover,
     second_frame,
@@ -59,8 +60,7 @@ async def test_recovering_twice_supplies_the_same_records_and_writes_nothing(aut
 
 
 async def test_a_recorder_that_recorded_nothing_leaves_no_folder(author: FolderWriter) -> None:
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     assert await drain(recovered) == []
     assert (recovered.all_stored, recovered.stored, recovered.lost) == (True, 0, ())
     recovered.release()
@@ -76,12 +76,10 @@ def test_the_folder_of_a_recorder_that_is_alive_or_drained_is_not_opened(spool: 
     assert draining is not None
     assert open_dead(queue.folder) is None
     draining.release()
-    first = open_dead(queue.folder)
-    assert first is not None
+    first = opened_dead(queue.folder)
     assert open_dead(queue.folder) is None
     first.release()
-    again = open_dead(queue.folder)
-    assert again is not None
+    again = opened_dead(queue.folder)
     again.release()
     assert open_dead(spool / "gone") is None
 
@@ -241,8 +239,7 @@ def test_a_segment_of_another_recorder_is_refused_by_name(author: FolderWriter, 
 async def test_foreign_files_in_a_folder_are_never_deleted(author: FolderWriter) -> None:
     author.put(started())
     (author.folder / "notes.txt").write_text("mine")
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     assert await drain(recovered) == [author.records[0], lost(2, 1, 2)]
     await recovered.acknowledge(2)
     recovered.release()
@@ -294,16 +291,14 @@ async def test_after_stored_segments_are_deleted_the_next_header_yields_the_same
         author.put(node(1), b"x" * 900)
     ends = [lost(10, 1, 9), lost(11, 2, 2)]
     assert len(author.segments) == 3
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     assert await drain(recovered) == [*author.records, *ends]
     left = [sum(1 for path, _, _ in author.places if path == segment) for segment in author.segments]
     for gone in range(3):
         await recovered.acknowledge(sum(left[:gone]))
         assert [path for path in author.segments if path.exists()] == author.segments[gone:]
         recovered.release()
-        recovered = open_dead(author.folder)
-        assert recovered is not None
+        recovered = opened_dead(author.folder)
         assert await drain(recovered) == [*author.records[sum(left[:gone]) :], *ends]
     await recovered.acknowledge(11)
     assert author.segments[2].exists()
@@ -444,8 +439,7 @@ async def supplied_before_damage(folder: Path, *, events_max: int = 10_000) -> l
 @pytest.mark.parametrize("events_max", [1, 100])
 async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(spool: Path, events_max: int) -> None:
     author = long_folder(spool)
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     assert not recovered.lost
     records: list[Record] = []
     while batch := await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0):
@@ -476,8 +470,7 @@ async def test_a_folder_is_not_deleted_while_the_thread_of_a_cancelled_task_sync
         sync_segments(folder, numbers)
 
     monkeypatch.setattr("pycrorm_async.queue.scan.sync_segments", sync_slowly)
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     synced = max(range(0, RECORDS, SYNCED_EVERY))
     reading = asyncio.create_task(recovered.get_batch(events_max=synced, bytes_max=2**22, age_s_max=0.0))
     assert await asyncio.to_thread(is_syncing.wait, 60)

@@ -11,7 +11,7 @@ import pytest
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from tests.queue.factories import SLOW, make, node, started
+from tests.queue.factories import SLOW, make, node, opened_dead, started
 
 GONE = "was deleted or replaced while the queue wrote to it"
 
@@ -133,6 +133,5 @@ async def test_a_folder_that_was_moved_away_stays_alive_until_the_process_ends(t
     assert [each.alive for each in Spool(back.parent).recorders()] == [True]
     assert open_dead(back) is None
     queue.release()
-    source = open_dead(back)
-    assert source is not None
+    source = opened_dead(back)
     source.release()

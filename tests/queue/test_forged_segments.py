@@ -178,11 +178,16 @@ async def test_a_file_larger_than_any_segment_is_damage_and_is_not_read(tmp_path
         Capacity.of(SMALL.__class__(segment_bytes=SEGMENT_BYTES_MAX + 1, spool_bytes_max=2**40))
 
 
-async def test_segment_numbers_out_of_range_are_foreign_files(tmp_path: Path) -> None:
+async def test_segments_are_read_in_order_and_numbers_out_of_range_are_foreign_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     author = journal(tmp_path)
     for stem in ("0" * 8, "9" * 40, "000000001", "\N{ARABIC-INDIC DIGIT ONE}" * 8):
         (author.folder / f"{stem}.segment").write_bytes(b"x")
-    assert list(segments_in(author.folder)) == [int(path.name[:8]) for path in author.segments]
+    listed = sorted(author.folder.iterdir(), reverse=True)  # a file system lists files in any order
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", lambda _: iter(listed))
+        assert list(segments_in(author.folder)) == [int(path.name[:8]) for path in author.segments]
     assert [each for each in await recover(author.folder) if each.payload != LOST] == author.records
     with pytest.raises(FileNotFoundError):
         read_segment(author.folder / "gone")

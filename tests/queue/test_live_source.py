@@ -33,6 +33,7 @@ from tests.queue.factories import (
     make,
     next_positions,
     node,
+    opened_dead,
     overwrite,
     record,
     recover,
@@ -252,8 +253,7 @@ async def test_recovery_ignores_and_deletes_the_progress_file(spool: Path) -> No
     await queue.synced_to()
     queue.release()
     overwrite(queue.folder / "progress", 128, b"\xff" * 64)
-    recovered = open_dead(queue.folder)
-    assert recovered is not None
+    recovered = opened_dead(queue.folder)
     assert await drain(recovered) == [record(1, started(), 1, b"{}"), lost(2, 1, 2)]
     await recovered.acknowledge(2)
     recovered.release()

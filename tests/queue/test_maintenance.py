@@ -16,7 +16,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_text
-from pycrorm_async.queue import RecorderQueue, Spool, open_dead
+from pycrorm_async.queue import RecorderQueue, Spool
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.maintenance import OpenEpisode, RepairReport, inspect_spool, repair_folder
 from pycrorm_async.queue.scan import scan
@@ -32,6 +32,7 @@ from tests.queue.factories import (
     lost,
     make,
     node,
+    opened_dead,
     overwrite,
     recover,
     started,
@@ -354,8 +355,7 @@ async def test_whatever_is_damaged_every_record_is_drained_or_reported(tmp_path:
     assert all(numbers == list(range(1, len(numbers) + 1)) for numbers in sequences.values())
     missing = {each.episode for each in author.records if each.position in unreadable}
     assert {each.episode for each in author.records if each.position in dropped} <= missing
-    recovered = open_dead(author.folder)
-    assert recovered is not None
+    recovered = opened_dead(author.folder)
     recovered.release()
 
 
@@ -421,8 +421,7 @@ def test_damage_is_reported_with_its_place_and_what_precedes_it(default_author: 
 
 def test_the_holders_of_a_folder_are_reported(default_author: FolderWriter) -> None:
     default_author.put(started())
-    recovered = open_dead(default_author.folder)
-    assert recovered is not None
+    recovered = opened_dead(default_author.folder)
     [one] = inspect_spool(default_author.folder.parent).recorders
     assert (one.alive, one.being_drained) == (True, True)  # the drainer of a dead folder holds both locks
     recovered.release()

@@ -17,14 +17,14 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_text, parse_episode_id
-from pycrorm_async.queue import RecorderQueue, Spool, locks, open_dead
+from pycrorm_async.queue import RecorderQueue, Spool, locks
 from pycrorm_async.queue.locks import FileLock, check_file_system, file_system_type, open_file
 from pycrorm_async.queue.sources import DeadLetters
 from pycrorm_async.queue.spool import make_folder
 from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.settings import FileAccess
 from tests.memory.note_actions import NoteActionPerformable, texts
-from tests.queue.factories import RECORDER, episode, make, started
+from tests.queue.factories import RECORDER, episode, make, opened_dead, started
 
 # === spool ====================================================================================================
 #
@@ -63,8 +63,7 @@ def test_listing_recorders_does_not_prevent_the_recovery_of_a_dead_folder(spool:
     thread.start()
     try:
         for _ in range(200):
-            recovered = open_dead(queue.folder)
-            assert recovered is not None
+            recovered = opened_dead(queue.folder)
             recovered.release()
     finally:
         looking = False

@@ -12,7 +12,7 @@ import pytest
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.operations.destination import stored_heads, stored_recorders, stored_records
-from pycrorm_async.queue import RecorderQueue, Spool, open_dead, stored_segments
+from pycrorm_async.queue import RecorderQueue, Spool, stored_segments
 from pycrorm_async.queue.format import Segment
 from pycrorm_async.queue.maintenance import inspect_spool
 from pycrorm_async.queue.scan import scan
@@ -30,6 +30,7 @@ from tests.queue.factories import (
     episode,
     make,
     node,
+    opened_dead,
     started,
     take,
 )
@@ -94,8 +95,7 @@ async def test_a_dead_recorders_segments_are_kept_without_the_torn_tail(tmp_path
     await queue.synced_to()
     folder = crashed_copy(queue, bound)
     stored = StoredSegments(bound, SMALL, wall_ns=Hours().wall_ns)
-    recovered = open_dead(folder, stored=stored)
-    assert recovered is not None
+    recovered = opened_dead(folder, stored=stored)
     for record in await drain(recovered, events_max=4):
         await recovered.acknowledge(record.position)
     recovered.release()
