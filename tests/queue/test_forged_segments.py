@@ -16,7 +16,7 @@ from pycrorm_async.errors import (
     SpoolForeign,
     SpoolUnavailable,
 )
-from pycrorm_async.events.codec import LOST, Record
+from pycrorm_async.events.codec import LOST, Heading, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.appender import Capacity
@@ -75,9 +75,13 @@ async def test_a_type_name_that_no_recorder_writes_is_damage_at_its_frame_and_a_
 
 
 def test_a_declaration_that_no_database_accepts_is_damage_and_the_folder_can_be_repaired(tmp_path: Path) -> None:
-    for payload, reason in ((b"\xff", "not valid UTF-8"), (b"\0", "not valid UTF-8")):
+    for heading, payload, reason in (
+        (DECLARED, b"\xff", "not valid UTF-8"),
+        (DECLARED, b"\0", "not valid UTF-8"),
+        (Heading(None, "NodeStarted", 1), b"{}", "holds a NodeStarted that belongs to no episode"),
+    ):
         author = FolderWriter(tmp_path / payload.hex())
-        author.put(DECLARED, payload)
+        author.put(heading, payload)
         author.sync()
         with pytest.raises(SpoolDamaged, match=reason):
             scan(author.folder, RECORDER)
