@@ -186,15 +186,6 @@ async def test_the_drainer_may_exit_and_later_records_are_drained_too(tmp_path: 
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
 
 
-@pytest.mark.soak
-async def test_of_two_experiments_on_one_memory_the_first_to_end_leaves_the_other_running(tmp_path: Path) -> None:
-    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
-    small = replace(SMALL, rollouts=150, evaluate=20, held_out=60, workers=1, min_samples_leaf=5)
-    first, second = await asyncio.gather(run(small, place), run(replace(small, seed=70, rollouts=500), place))
-    assert [each.tally.rollouts for each in first.phases] == [150, 20, 60]
-    assert [each.tally.rollouts for each in second.phases] == [500, 20, 60]
-
-
 async def test_workers_that_are_not_free_take_no_job() -> None:
     job = RolloutTask(Scene(), default_policy(), 5, recorded=False)
     workers = Workers(1, None)

@@ -194,27 +194,17 @@ def test_the_best_cells_are_ordered_by_value_then_distance_to_the_origin_then_in
     assert costmap.best(0) == []
 
 
-def test_maps_multiply_cell_by_cell() -> None:
-    origin = Pose([1, 1, 0])
-    first = Costmap(np.array([[0.5, 1.0], [0.0, 0.2]]), origin, resolution_m=0.1)
+def test_maps_multiply_cell_by_cell_if_place_size_and_resolution_are_the_same_and_are_read_only() -> None:
+    first = Costmap(np.array([[0.5, 1.0], [0.0, 0.2]]), Pose([1, 1, 0]), resolution_m=0.1)
     second = Costmap(np.array([[0.5, 0.3], [1.0, 1.0]]), Pose([1, 1, 0]), resolution_m=0.1)
     np.testing.assert_allclose((first * second).map, [[0.25, 0.3], [0.0, 0.2]])
-    assert (first * second).origin is origin
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        GaussianCostmap(Pose([1, 0, 0]), size_cells=10),
-        GaussianCostmap(Pose(), size_cells=11),
-        GaussianCostmap(Pose(), size_cells=10, resolution_m=0.03),
-    ],
-)
-def test_maps_of_another_place_size_or_resolution_are_not_multiplied(other: Costmap) -> None:
-    with pytest.raises(CostmapMismatch):
-        GaussianCostmap(Pose(), size_cells=10) * other
-
-
-def test_a_map_is_read_only() -> None:
+    assert (first * second).origin is first.origin
     with pytest.raises(ValueError, match="read-only"):
-        GaussianCostmap(Pose()).map[0, 0] = 1.0
+        first.map[0, 0] = 1.0
+    for other in (
+        Costmap(first.map, Pose([1, 0, 0]), resolution_m=0.1),
+        Costmap(np.ones((3, 3)), first.origin, resolution_m=0.1),
+        Costmap(first.map, first.origin, resolution_m=0.2),
+    ):
+        with pytest.raises(CostmapMismatch):
+            first * other
