@@ -16,7 +16,7 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, ImpossibleCondition, PolicyDamaged, PolicyFileRefused
-from pycrorm_async.learning import MoveAndPickUp, Scene, batch_rollout, name_of, read_policy
+from pycrorm_async.learning import MoveAndPickUp, Scene, batch_rollout, name_of, read_policy, record_policy
 from pycrorm_async.learning.experiment import Experiment, run
 from pycrorm_async.learning.policy import (
     Evidence,
@@ -420,6 +420,13 @@ async def test_each_pick_up_names_its_policy_and_the_memory_holds_it_after_its_f
             assert (await session.get_one(TaskTreeNode, kept.node_id)).dtype == "Retry"
             picked = set(await session.scalars(select(PickUpWithContextView.policy)))
         assert await read_policy(memory.reading, batches[0].policy) == OTHER
+        name = await record_policy(memory, OTHER, episodes=["a"], successes=7, min_samples_leaf=3)
+        await memory.flush()
+        async with memory.session() as session:
+            learned = (await session.scalars(select(LearnPolicyAction))).one()
+        assert (name, learned.policy) == (name_of(OTHER), name_of(OTHER))
+        assert (learned.successes, learned.min_samples_leaf, learned.rollouts, learned.scene) == (7, 3, None, None)
+        assert (learned.training_episodes, learned.episode_count, learned.seeds) == (["a"], 1, [])
         with pytest.raises(CallerError, match="the memory holds no policy '0123456789ab'"):
             await read_policy(memory.reading, "0123456789ab")
     assert [(each.policy, each.arms, each.grasps) for each in batches] == [

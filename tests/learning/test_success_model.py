@@ -211,7 +211,6 @@ def test_probabilities_equal_those_of_scikit_learn_also_where_features_are_missi
     assert SuccessModel.fit(circumstances) == model
 
 
-@pytest.mark.slow
 def test_a_model_does_not_take_the_luck_of_some_rows_for_a_chance() -> None:
     pytest.importorskip("sklearn")
     rng = np.random.default_rng(44)
