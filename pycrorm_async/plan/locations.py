@@ -670,24 +670,26 @@ _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 def surface_poses(link: str, whole: objects.ObjectLike, obj: objects.ObjectLike | None) -> Iterator[Pose | Refusal]:
     """Yield poses for `obj` on top of the link, with the link's heading, and refusals of occupied places."""
     support = objects.in_world(whole)
-    obj_to_put = objects.in_world(obj) if obj is not None else None
     heading = yaw_quaternion(support.link_pose(link).yaw)
-    extent = _extent(obj_to_put, heading) if obj_to_put is not None else _POINT
+    extent, occupied = _POINT, []
+    if obj is not None:
+        obj_to_put = objects.in_world(obj)
+        extent = _extent(obj_to_put, heading)
+        outermost = _outermost(obj_to_put)
+        occupied = [
+            (each.name, each.bounding_box())
+            for each in support.world.objects
+            if each is not support and _outermost(each) is not outermost  # what moves with the object is not in its way
+        ]
+        if collisions_count():
+            others = (each for each in support.links if each != link and support.body.solids[each])
+            occupied += [(each, support.bounding_box(each)) for each in others]
     surface = support.bounding_box(link)
     z = surface.max.z - extent.min.z
-    occupied = [
-        (each.name, each.bounding_box())
-        for each in support.world.objects
-        if each is not support and not _moves_along(each, obj_to_put)
-    ]
-    if collisions_count():
-        others = (each for each in support.links if each != link and support.body.solids[each])
-        occupied += [(each, support.bounding_box(each)) for each in others]
     for x, y in _grid_points(surface, extent):
         placed_box = _translate(extent, x, y, z)
         pose = Pose((x, y, z), heading)
-        obstacles = (name for name, box in occupied if obj_to_put is not None and _overlap(placed_box, box))
-        obstacle = next(obstacles, None)
+        obstacle = next((name for name, box in occupied if _overlap(placed_box, box)), None)
         yield pose if obstacle is None else Refusal(pose, f"{obstacle} is in the way")
 
 
@@ -729,18 +731,8 @@ def _overlap(a: BoundingBox, b: BoundingBox) -> bool:
     )
 
 
-def _moves_along(each: Object, obj_to_put: Object | None) -> bool:
-    """Return whether `each` is the object to place, carries it, or is carried by it, and so is no obstacle."""
-    if obj_to_put is None:
-        return False
-    chain = {obj_to_put}
-    above = obj_to_put.attached_to
-    while above is not None:
-        chain.add(above)
-        above = above.attached_to
-    below: Object | None = each
-    while below is not None:
-        if below in chain:
-            return True
-        below = below.attached_to
-    return False
+def _outermost(carried: Object) -> Object:
+    """Return the object that carries this one, directly or through others, and is not carried itself."""
+    while (carrier := carried.attached_to) is not None:
+        carried = carrier
+    return carried

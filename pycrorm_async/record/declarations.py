@@ -14,7 +14,7 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from datetime import datetime
 from enum import Enum
-from functools import partial
+from functools import cache, partial
 from operator import itemgetter
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -164,7 +164,12 @@ def declare_named(
             return reason
         if built_in is not None and built_in.kind != kind:
             return f"the built-in type {dtype} is a {built_in.kind}, not a {kind}"
-        return _fault_in_aliases(declaration, known_types)
+        for alias in declaration.aliases:
+            for field in declaration.fields:
+                reason = known_types.fault_in_field(field, event_fields.table_name(alias))
+                if reason is not None:
+                    return f"its alias {alias!r} does not fit: field {field.name!r}: {reason}"
+        return None
 
     own_fields = [
         OwnField(str(name), itemgetter(name), shape := _shape(spec), "" if shape else _no_type(spec), (name,))
@@ -223,16 +228,6 @@ def _dtype_candidates(own: str, kind: str) -> Iterator[str]:
     yield f"{plain}{kind.title()}"
 
 
-def _fault_in_aliases(declaration: event_types.DesignatorTypeDeclared, known_types: KnownTypes) -> str | None:
-    """Return the reason why the table of a former dtype cannot be this one's; None if it can."""
-    for alias in declaration.aliases:
-        for field in declaration.fields:
-            reason = known_types.fault_in_field(field, event_fields.table_name(alias))
-            if reason is not None:
-                return f"its alias {alias!r} does not fit: field {field.name!r}: {reason}"
-    return None
-
-
 def _unreserved(own: Sequence[OwnField]) -> dict[str, str]:
     """Return the names of fields with as many underscores as make them ones that no other field has."""
     kinds = {each.name: each.shape.kind for each in own if each.shape is not None}
@@ -263,7 +258,10 @@ def _named(
             enum=recorded_name(shape.enum) if shape.enum is not None else None,
             item=shape.item,
         )
-        reason = _fault_in_field(field, taken) or contradiction(field)
+        if candidate.isidentifier() and not candidate.startswith("_"):
+            reason = taken.fault_in(field) or contradiction(field)
+        else:
+            reason = f"{cut(candidate, 100)!r} is not a valid field name"
         if reason is None:
             return field, first_reason if candidate != unreserved else ""
         first_reason = first_reason or reason
@@ -280,12 +278,6 @@ def _candidates(name: str, unreserved: str, shape: FieldShape, columns: Collecti
     if plain != name:
         yield plain
     yield f"{plain}_{shape.kind}"
-
-
-def _fault_in_field(field: event_types.FieldDeclared, taken: event_fields.AcceptedFields) -> str | None:
-    if not field.name.isidentifier() or field.name.startswith("_"):
-        return f"{cut(field.name, 100)!r} is not a valid field name"
-    return taken.fault_in(field)
 
 
 # === types of fields ==========================================================================================
@@ -358,16 +350,13 @@ _SCALARS: tuple[tuple[type, event_types.FieldType], ...] = (
 
 
 def _union_shape(hint: Any) -> FieldShape | None:
-    members = [each for each in typing.get_args(hint) if each is not type(None)]
-    optional = len(members) < len(typing.get_args(hint))
-    shapes = {shape._replace(optional=False) if shape else None for shape in map(shape_of, members)}
-    optional = optional or any(shape is not None and shape.optional for shape in map(shape_of, members))
-    if shapes == {FieldShape("integer"), FieldShape("real")}:
-        shapes = {FieldShape("real")}
-    if len(shapes) != 1:
-        return None
-    shape = shapes.pop()
-    return shape._replace(optional=optional) if shape is not None else None
+    members = typing.get_args(hint)
+    shapes = [shape_of(each) for each in members if each is not type(None)]
+    optional = len(shapes) < len(members) or any(each is not None and each.optional for each in shapes)
+    different = {each._replace(optional=optional) if each is not None else None for each in shapes}
+    if different == {FieldShape("integer", optional), FieldShape("real", optional)}:
+        return FieldShape("real", optional)
+    return different.pop() if len(different) == 1 else None
 
 
 def _container_shape(origin: type, arguments: tuple[Any, ...]) -> FieldShape | None:
@@ -398,25 +387,16 @@ _COLUMNS_MAX = 500
 class KnownTypes:
     """The declared types of one memory. A field of one dtype has one type in all its declarations.
 
-    Args:
-        built_in: returns the declaration of the plan layer's own type with this dtype; None if it has none.
+    Attributes:
+        built_in: returns the declaration of the plan layer's own type with this dtype; None if it has none. Each answer
+            is kept for the life of the memory, because finding that there is none searches all classes.
     """
 
     def __init__(self, built_in: Callable[[str], event_types.DesignatorTypeDeclared | None]) -> None:
-        self._find_built_in = built_in
-        self._built_in: dict[str, event_types.DesignatorTypeDeclared | None] = {}
+        self.built_in = cache(built_in)
         self._fields_by_dtype: dict[str, dict[str, str]] = {}
         self._tables: dict[str, str] = {}
         self._columns: dict[str, dict[str, event_types.FieldDeclared]] = {}
-
-    def built_in(self, dtype: str) -> event_types.DesignatorTypeDeclared | None:
-        """Return the declaration of the plan layer's own type with this dtype; None if it has none.
-
-        Each answer is kept for the life of the memory, because finding that there is none searches all classes.
-        """
-        if dtype not in self._built_in:
-            self._built_in[dtype] = self._find_built_in(dtype)
-        return self._built_in[dtype]
 
     def fields_of(self, dtype: str) -> Mapping[str, str]:
         """Return the types of the fields of a dtype as this memory declared them, as `type_text` describes them."""

@@ -164,13 +164,18 @@ class Activations(EpisodeBlock, Generic[B]):
                     parent = latest.parent
                     if parent is None or parent.is_open:
                         latest.ticks += 1
-                        if self._pending:
-                            self._count_pending()
+                        for each in self._pending:
+                            each.ticks += 1
+                        self._pending.clear()
                         return
                     if self._latest.get(id(parent.behaviour)) is parent:
                         self._pending.append(latest)
                         return
-            self._change(behaviour, status)
+            self._changed = True
+            pending, self._pending = self._pending, []
+            for each in pending:
+                self._record(each.behaviour, each.status)
+            self._record(behaviour, status)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a tick
             self._recording.note_fault(self._executive, error)
 
@@ -196,18 +201,6 @@ class Activations(EpisodeBlock, Generic[B]):
             method(*arguments)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a tick
             self._recording.note_fault(self._executive, error)
-
-    def _count_pending(self) -> None:
-        for each in self._pending:
-            each.ticks += 1
-        self._pending.clear()
-
-    def _change(self, behaviour: B, status: object) -> None:
-        self._changed = True
-        pending, self._pending = self._pending, []
-        for each in pending:
-            self._record(each.behaviour, each.status)
-        self._record(behaviour, status)
 
     def _record(self, behaviour: B, status: object) -> None:
         activation = self._enter(behaviour)
