@@ -40,12 +40,10 @@ from pycrorm_async.plan.failures import (
 )
 from pycrorm_async.plan.geometry import (
     Handle,
-    closed_position,
     grasp_pose,
     hand_poses,
     handle_of,
     handle_poses,
-    opened_position,
 )
 from pycrorm_async.plan.locations import REFUSALS_MAX
 from pycrorm_async.world import Arms, Object, ObjectType, Pose
@@ -289,16 +287,6 @@ def test_a_handle_moves_with_the_nearest_joint_above_it(scene: Scene) -> None:
     crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
     assert handle_of(ObjectPart("hook", crane)).joint == "reaching"
     assert handle_of(ObjectPart("flag", crane)).joint == "turning"
-
-
-def test_opening_leaves_a_margin_and_never_closes(scene: Scene) -> None:
-    drawer = handle_of(ObjectPart(DRAWER, scene.kitchen))
-    assert opened_position(drawer) == pytest.approx(0.30)
-    assert closed_position(drawer) == 0.0
-    scene.kitchen.set_joint_position(drawer.joint, 0.33)
-    assert opened_position(drawer) == 0.33
-    door = handle_of(ObjectPart(FRIDGE_HANDLE, scene.kitchen))
-    assert [opened_position(door), closed_position(door)] == pytest.approx([1.85, 0.0])
 
 
 def test_a_drawers_handle_moves_straight_in_steps_of_five_centimetres(scene: Scene) -> None:

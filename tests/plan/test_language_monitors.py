@@ -164,10 +164,13 @@ async def test_each_of_nested_monitors_interrupts_what_is_inside_it() -> None:
 
 @pytest.mark.parametrize("between_nodes", [True, False])
 @pytest.mark.parametrize("asks_later", [True, False])
+@pytest.mark.parametrize(
+    ("bug", "status"),
+    [(ZeroDivisionError("bug"), TaskStatus.ERROR), (asyncio.CancelledError("no camera"), TaskStatus.CANCELLED)],
+)
 async def test_an_exception_of_a_condition_interrupts_the_plan_and_is_raised(
-    between_nodes: bool, asks_later: bool
+    between_nodes: bool, asks_later: bool, bug: BaseException, status: TaskStatus
 ) -> None:
-    bug = ZeroDivisionError("bug")
     checks = 0
 
     def holds() -> bool:
@@ -182,11 +185,11 @@ async def test_an_exception_of_a_condition_interrupts_the_plan_and_is_raised(
 
     inside: Any = Step("a") * 1000 if between_nodes else Around(Waiting())
     monitor = Monitor(holds_later if asks_later else holds, interval_s=0.001)
-    with collected_tree() as tree, pytest.raises(ZeroDivisionError) as caught:
+    with collected_tree() as tree, pytest.raises(type(bug)) as caught:
         await (inside >> monitor).perform()
     assert caught.value is bug
     statuses = [node.status for node in tree if node.status is not TaskStatus.SUCCEEDED]
-    assert statuses[0] is TaskStatus.ERROR
+    assert statuses[0] is status
     assert set(statuses[1:]) == {TaskStatus.INTERRUPTED}
 
 
@@ -396,30 +399,6 @@ async def test_a_condition_that_ignores_its_cancellation_does_not_outlive_the_pl
 
     async with asyncio.timeout(10):
         assert await (Waiting() >> Monitor(stubborn, interval_s=0.001)).perform() == DONE
-
-
-@pytest.mark.parametrize("asks_later", [True, False])
-async def test_a_cancelled_condition_interrupts_like_one_that_raises(asks_later: bool) -> None:
-    checks = 0
-
-    def broken() -> bool:
-        nonlocal checks
-        checks += 1
-        if checks > 2:
-            raise asyncio.CancelledError("the camera is gone")
-        return False
-
-    async def broken_later() -> bool:
-        return broken()
-
-    class Waiting(ActionAbstract):
-        async def perform(self) -> None:
-            await asyncio.Event().wait()
-
-    plan = Waiting() >> Monitor(broken_later if asks_later else broken, interval_s=0.001)
-    with pytest.raises(asyncio.CancelledError):
-        async with asyncio.timeout(10):
-            await plan.perform()
 
 
 def test_a_condition_that_awaits_an_event_is_refused_with_the_event_suggested() -> None:
