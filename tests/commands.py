@@ -80,8 +80,8 @@ def _run_child(connection: Connection, settings: dict[str, str], entry: Callable
 
 
 _IN_PROCESS = frozenset(
-    "ask copy datasette-metadata diff episodes events export picture plot query rebuild recall report roles schema show"
-    " spool status tag verify watch".split()
+    "ask copy datasette-metadata diff episodes events export import picture plot query rebuild recall report roles"
+    " schema show spool status tag verify watch".split()
 )
 """The verbs that read, or write a file: they import no plan, start no process and end by themselves."""
 
