@@ -110,18 +110,16 @@ class ClusterWorkers:
 
         Raises `MissingExtra`, and `CallerError` if no scheduler or worker answers, or a worker has another version.
         """
-        try:
-            self._client = await self._stack.enter_async_context(_connected(self._cluster))
+        async with AsyncExitStack() as stack:
+            self._client = await stack.enter_async_context(_connected(self._cluster))
             if self._place is not None:
                 address = shared_address(self._place.url)
                 spool = (self._place.spool or address.default_spool).absolute()
                 place = MemoryLocation(self._place.url, spool)
-                self._daemon.append(await self._stack.enter_async_context(pool.run_daemon(place)))
+                self._daemon.append(await stack.enter_async_context(pool.run_daemon(place)))
                 host = socket.gethostname() if address.is_sqlite else None
                 self._destination = _Destination(spool, address.to_type, Spool(spool).log_id(), host)
-        except BaseException:
-            await self._stack.aclose()
-            raise
+            self._stack = stack.pop_all()
         return self
 
     async def __aexit__(self, *_: object) -> None:

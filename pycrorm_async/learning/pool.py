@@ -112,29 +112,27 @@ class Workers:
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
-        try:
+        async with AsyncExitStack() as stack:
             if self._place is not None:
-                self._daemon.append(await self._stack.enter_async_context(run_daemon(self._place)))
+                self._daemon.append(await stack.enter_async_context(run_daemon(self._place)))
+            stack.push_async_callback(self._end_workers)
             for _ in range(self._count):
                 process = ChildProcess.start(_run_worker, "pycrorm rollouts", self._place, dies_with_parent=False)
                 self._processes.append(process)
             self._is_free = True
-        except BaseException:
-            await self._close()
-            raise
+            self._stack = stack.pop_all()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._close()
+        await self._stack.aclose()
 
-    async def _close(self) -> None:
-        """Close the pipes, wait until the workers have closed their memories and exited, then stop the daemon."""
+    async def _end_workers(self) -> None:
+        """Close the pipes, and wait until the workers have closed their memories and exited; the daemon ends later."""
         self._is_free = False
         for process in self._processes:
             process.connection.close()
         for process in self._processes:
             await asyncio.to_thread(process.process.join)
-        await self._stack.aclose()
 
     async def roll_out(
         self, job: RolloutTask, runs: Iterable[tuple[int, int]], report: Callable[[Tally], None] = lambda _: None
