@@ -148,3 +148,12 @@ async def test_verify_names_a_description_that_changed_or_is_gone_and_its_blob(f
     result = await verified(filled)
     assert [str(each) for each in result.damages] == [f"episode 1, event 5: the description {name} was never declared"]
     assert result.differences == []
+
+
+async def test_verify_names_two_descriptions_that_were_exchanged(filled: str) -> None:
+    unlock(filled)
+    [first, second] = [name for (name,) in ask(filled, f"SELECT fingerprint {DESCRIBED} ORDER BY 1 LIMIT 2")]
+    for name, new in ((first, "urdf-"), (second, first), ("urdf-", second)):
+        ask_to_change(filled, f"UPDATE pycrorm_declaration SET fingerprint = '{new}' WHERE fingerprint = '{name}'")
+    damages = {str(each) for each in (await verified(filled)).damages}
+    assert damages == {f"the description {name} does not match its fingerprint" for name in (first, second)}
