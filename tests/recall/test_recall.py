@@ -239,6 +239,30 @@ async def test_an_event_that_is_read_from_the_log_and_observed_is_folded_once(tm
         assert await running.new() == ([], [])
 
 
+async def test_episodes_that_are_not_stored_yet_have_numbers_of_their_own(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'empty.db'}"):
+        pass
+    async with (
+        Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as memory,
+        Reading.open(f"sqlite:///{tmp_path / 'empty.db'}") as empty,  # in whose log no episode gets a number
+    ):
+        running = ProcessCases(
+            memory._open_parts.emitter,
+            open_episodes=list,
+            flush=memory.flush,
+            log=empty.log,
+            clock=SYSTEM_CLOCK,
+        )
+        assert await running.new() == ([], [])
+        for level in (0.7, 0.8):
+            async with memory.episode():
+                await grip(Arms.LEFT, level)
+        numbered, unnumbered = await running.new()
+        assert [*numbered] == []
+        assert [round(case.numbers["level"], 1) for case in unnumbered] == [0.7, 0.8]
+        assert len({case.node for case in unnumbered}) == 2
+
+
 async def test_events_that_found_the_buffer_full_are_read_from_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
