@@ -531,7 +531,8 @@ async def _stopped(log: EventLog, episode: stored.EpisodeRow | None) -> list[fin
     """Return the parked and refused episodes."""
     rows = [each for each in await log.stopped() if episode is None or each.number == episode.number]
     refused = [findings.StoppedEpisode(each.number, "refused", each.refused) for each in rows if each.refused]
-    return refused + [findings.StoppedEpisode(each.number, "parked", each.parked) for each in rows if each.parked]
+    parked = [findings.StoppedEpisode(each.number, "parked", each.parked) for each in rows if each.parked]
+    return sorted(refused + parked, key=lambda each: each.number)
 
 
 async def _check_heads(log: EventLog, within: findings.EpisodeRange, result: findings.VerifyResult) -> int:
