@@ -129,7 +129,7 @@ def test_six_of_many_curves_have_room_and_the_others_are_found_by_name(chrome: B
         tab.ask("pycrormPage.panels.open('states')")
         choose(tab, *tab.ask(names)[:7])
         assert len(tab.ask(DRAWN)) == 6
-        assert "no more have room" in tab.ask("document.querySelector('.panel').textContent")
+        tab.wait_for("document.querySelector('.panel').textContent.includes('no more have room')")
         tab.ask("document.querySelector('.panel input').focus()")
         for key in "elbow":  # of which w and a are keys of the page, too
             tab.press(key)
