@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "pycrorm_async"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-CODE_LINES_MAX = 56_129
+CODE_LINES_MAX = 56_130
 """Bounds the lines of code of the package: lower it when it gets smaller. Only a feature may raise it, by what it
 adds: engines of worlds 650, imports and the exports that mirror them 4,300, the compiled core and cheap starts 950,
 partitions, shards and shared folds 900, erasure and the lake 1,200, pages of a fleet and of pictures 1,000; poolers,
