@@ -20,7 +20,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.bullet import reuse_clients
 from tests.commands import fork_child
-from tests.databases import Server, put_memory, server_in_memory
+from tests.databases import PARTITIONS, Server, put_memory, server_in_memory
 from tests.long_modules import long_modules_first
 from tests.report.browser import Browser, browser, chromium
 from tests.soak_turns import current_commit, place_of, runs_in_turns, turn_of
@@ -177,13 +177,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _select(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the variants that `soak_on` names as soak, and keep of the soak only the requested turn."""
+    """Mark the variants that `soak_on` names as soak, and keep of the soak only the requested turn.
+
+    On partitioned tables these variants run too: what adds no SQL of its own meets partitions only there.
+    """
     for item in items:
         variants = (
             item.callspec.params.values() if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ()
         )
         in_turns = item.get_closest_marker("slow") and runs_in_turns(item.path, item.name.partition("[")[0])
-        if in_turns or any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants):
+        has_soak_on = any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants)
+        if in_turns or (has_soak_on and not PARTITIONS):
             item.add_marker(pytest.mark.soak)
     commit = config.getoption("--soak-turn")
     if commit is None:
