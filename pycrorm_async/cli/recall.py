@@ -20,7 +20,7 @@ from pycrorm_async.recall.search import closest
 
 _TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
 _K = 10
-"""The number of actions by default: as many as a terminal shows with the command that asked for them."""
+"""The number of actions by default: as many as a terminal shows on one page with the command."""
 
 
 def recall(
@@ -36,14 +36,14 @@ def recall(
     like: Annotated[
         str | None,
         typer.Option(
-            metavar="EPISODE/EVENT", help="Seek actions in a situation as that of the action that this event began."
+            metavar="EPISODE/EVENT", help="List actions in a situation like that of the action which this event began."
         ),
     ] = None,
     follows: Annotated[
         bool, typer.Option("--follows", help="Count what came next after the actions of a type, and how that ended.")
     ] = False,
-    status: Annotated[str | None, typer.Option(help="With --follows: only after actions that ended so.")] = None,
-    reason: Annotated[str | None, typer.Option(help="With --follows: only after actions that failed so.")] = None,
+    status: Annotated[str | None, typer.Option(help="With --follows: only after actions of this status.")] = None,
+    reason: Annotated[str | None, typer.Option(help="With --follows: only after failures of this class.")] = None,
     k: Annotated[int, typer.Option("--limit", "--k", metavar="N", help="The number of actions.")] = _K,
     before: Annotated[
         str | None, typer.Option(metavar="MOMENT", help="Started before: 2026-11-20, with time, in UTC.")
@@ -78,7 +78,7 @@ def recall(
         _follows(parsed, like, place, form, status=status, reason=reason)
         return
     if like is None and not any(parsed[:-1]):  # `only:` chooses among the cases of a cue
-        raise CallerError("name a type or features, for example `pycrorm recall PickUpAction arm=LEFT`, or add --like")
+        raise CallerError("name a type or a feature to rank by: `pycrorm recall PickUpAction arm=LEFT`, or add --like")
     if like is not None and cue:
         raise CallerError("--like takes the cue from an action: leave out the type and the features")
 
@@ -95,7 +95,7 @@ def recall(
         return answer, await memory.types(), await answer.outcomes()
 
     answer, types, outcomes = place.read(query)
-    if not form.is_table:  # else the answer itself has the line
+    if not form.is_table:  # a table is followed by `answer.why()`, which says the same
         _note_unknown(answer.cue.type, types)
     if form.is_table:
         _print(answer, outcomes, why=why)

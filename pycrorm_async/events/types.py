@@ -1,8 +1,9 @@
 """Event types are frozen values, the payloads of the log.
 
 Each `Happening` class is an event type, named as in the log; `version` counts its shapes. The JSON omits each field
-that has its default value; most defaults are null or empty. The sequence of `ObjectAdded` identifies an object, that of
-`NodeStarted` a node. The envelope of an event contains its times.
+that has its default value, except in `PoseValue`; most defaults are null or empty. The number of an event in its
+episode is its sequence: that of `ObjectAdded` identifies an object, that of `NodeStarted` a node. The envelope of an
+event contains its times.
 """
 
 from __future__ import annotations
@@ -19,8 +20,6 @@ import msgspec
 # === values ===================================================================================================
 #
 # Values are the frozen parts of events: poses, references to objects and nodes, failures, fields of a declaration.
-#
-# The JSON omits each field that has its default value; most defaults are null or empty.
 
 NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
 NodeStatus: TypeAlias = Literal[
@@ -62,12 +61,11 @@ class PoseValue(_Value, frozen=True, omit_defaults=False):
 
 
 class PoseReference(_Value, frozen=True):
-    """A parameter whose pose is that of a node around its own, as the target of a motion is that of its action.
+    """A parameter with the same pose as one of a node around its own: the target of a motion is that of its action.
 
     Attributes:
-        pose_of: the sequence of that node's NodeStarted, which has the pose itself.
-        field: the key of its parameter.
-        slot: that of the field.
+        pose_of: the sequence of the NodeStarted of the node around it, which has the pose itself.
+        field, slot: the name and the slot of that node's parameter.
     """
 
     pose_of: int
@@ -124,8 +122,8 @@ class ObjectReference(_Value, frozen=True):
 class ObjectValue(_Value, frozen=True):
     """A copy of an object without an ObjectAdded: a part of one, a believed one, or one outside the recorded world.
 
-    The fold makes a row of `object` from it for each parameter that is one. `part_of` is the object that an ObjectPart
-    belongs to, or the one relative to which a LocatedObject is located.
+    The fold adds a row to the table `object` for each parameter that is an `ObjectValue`. `part_of` is the object that
+    an ObjectPart belongs to, or the one relative to which a LocatedObject is located.
     """
 
     dtype: Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
@@ -138,8 +136,8 @@ class ObjectValue(_Value, frozen=True):
 class RobotValue(_Value, frozen=True):
     """The robot that acted at the start of a node: base pose, torso joint position in metres (None without torso).
 
-    `pose` is None if the row of `object` has it, as that of a robot of the recorded world has: there it is not written
-    again for every node. `name` is that of its object in the world; None in events of older versions.
+    `pose` is None if the robot is in the recorded world: then the event that `object.row` names has its pose, which is
+    not written again for every node. `name` is that of its object in the world; None in events of older versions.
     """
 
     pose: PoseValue | None = None
@@ -376,8 +374,8 @@ class EpisodeStarted(Happening, frozen=True):
 class EpisodeEnded(Happening, frozen=True):
     """The last event of an episode. Only recovery writes the status LOST.
 
-    `continued_in` is the UUID of the episode that continues this one, if this one ran out of sequences. `world` is the
-    description, in one line, of the world that was entered inside the episode, as it was when it was left.
+    `continued_in` is the UUID of the episode that continues this one, if this one ran out of sequences. `world`
+    describes, in one line, the world that was entered inside the episode, in the state in which the plan left it.
     """
 
     status: EpisodeStatus
@@ -389,7 +387,7 @@ class EpisodeEnded(Happening, frozen=True):
 class EpisodeTagged(Happening, frozen=True):
     """An episode got tags and lost others. The only event that may follow `EpisodeEnded`.
 
-    An episode has a tag if the last event that names it adds it.
+    An episode has a tag if the latest event that names the tag added it.
     """
 
     added: tuple[str, ...] = ()
@@ -569,7 +567,7 @@ class NodeEnded(Happening, frozen=True):
 
     @property
     def has_time(self) -> bool:
-        """Whether the node ended at the time of the event; not if recovery computed the end."""
+        """Whether the node ended at the time of the event: not if it is LOST, nor if its end was reported later."""
         return self.status != "LOST" and not self.untimed
 
 
@@ -656,7 +654,7 @@ EVENT_TYPES: dict[str, type[Happening]] = {kind.__name__: kind for kind in Happe
 #
 # Find the blobs that an event refers to in its payload, without decoding it.
 #
-# The bytes of a `BlobReference` are unmistakable: inside a JSON text every quotation mark is escaped, and `observe`
+# The bytes of a `BlobReference` are unmistakable: inside a JSON string every quotation mark is escaped, and `observe`
 # accepts no key that begins with `$`. The encoder writes its fields in the order of their declaration, without spaces.
 
 BLOB_KEY: Final = "$blob"

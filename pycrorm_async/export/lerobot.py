@@ -2,9 +2,9 @@
 
 The files are `meta/`, `data/` and `videos/`, written with pyarrow and PyAV alone.
 
-Each frame has `observation.state` and `action`, the state of the next frame (the last one repeats its own), the event
-and the time behind it, the subtask, and the images of `lerobot_images`. `meta/plan.parquet` is ours: every node of the
-plans, with its first and last frame. LeRobot ignores it.
+Each frame has `observation.state` and `action`, the state of the next frame (the last one repeats its own), the last
+event up to it, its time, the subtask, and the images of `lerobot_images`. `meta/plan.parquet` is ours: every node of
+the plans, with its frames from `dataset_from_index` up to, and without, `dataset_to_index`. LeRobot ignores it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pycrorm_async.query.text import parameters_text
 from pycrorm_async.writer.drain import run_to_completion
 
 FPS = 10
-"""Frames per second; nominal if there is one frame for each event, because LeRobot requires a value."""
+"""Frames per second. With a frame for each change of the state (clock `event`) it says nothing: LeRobot needs it."""
 _FILE_MEGABYTES = 100
 """The size in MiB above which the next episode begins a new file, the default of LeRobot."""
 _VECTORS = ("observation.state", "action")
@@ -40,15 +40,15 @@ _IMAGES_AT_ONCE = 128
 async def write_lerobot(job: Job, folder: Path) -> Written:
     """Write the episodes into an empty folder.
 
-    An episode that cannot be read is left out, unless it is the only one. Raises `CallerError` for episodes that the
-    format cannot hold, and `MissingExtra`.
+    An episode that cannot be read is left out; if none can be read, the error of the last one is raised. Raises
+    `CallerError` for episodes that the format cannot hold, and `MissingExtra`.
     """
     size, fps, episodes = job.options["images"], job.options["fps"], job.selection.episodes
     observed = [] if size == "none" else await lerobot_images.observed_cameras(job.reading, episodes)
     cameras = lerobot_images.features_of(observed, folder, fps)
     if size not in (None, "none"):
         if any(each.feature == lerobot_images.DRAWN for each in observed):
-            raise CallerError("the images of a camera that is named scene are observed: leave out the drawn ones")
+            raise CallerError("a recorded camera has the name of the drawn images, scene: export without drawn ones")
         cameras.append(lerobot_images.Camera(lerobot_images.DRAWN, tuple(size), folder, fps, is_video=False))
     dataset = LeRobotFolder(folder, cameras, fps=fps)
     try:
@@ -79,8 +79,8 @@ async def _add_episodes(
             if len(unreadable) == len(episodes):
                 raise
             continue
-        # A thread does each long step, and a cancelled task waits for its end: to delete a file to which a thread still
-        # writes would leave a part of it.
+        # Long steps run in threads. A cancelled export waits for its thread, which may still write to a file, before
+        # the files are deleted.
         frames = await run_to_completion(
             asyncio.to_thread(frames_of, episode, job.options["clock"], job.options["fps"])
         )
@@ -175,7 +175,7 @@ class LeRobotFolder:
     def finish(self) -> None:
         """Complete the files, and write those in `meta/`, which describe the episodes."""
         self.close()
-        assert self._first is not None, "an episode was added"
+        assert self._first is not None, "no episode was added"
         _, frames = self._first
         meta = self._folder / "meta"
         (meta / "episodes" / "chunk-000").mkdir(parents=True)
@@ -262,7 +262,7 @@ class LeRobotFolder:
         self._file_bytes += table.nbytes
 
     def _add_plan(self, episode: ExportedEpisode, frames: Frames, number: int) -> None:
-        """Note every node with the frames from its start to its end; `to_index` is behind the last one."""
+        """Note every node with the frames from its start to its end; of one without an end, to the last frame."""
         sequences = np.array([each.sequence for each in frames.at])
         for node in episode.nodes.values():
             begin = int(np.searchsorted(sequences, node.start.sequence, side="left"))

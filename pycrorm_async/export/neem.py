@@ -1,17 +1,18 @@
 """Write an episode as a NEEM: the folder that `remember` of KnowRob reads, and that `pycrorm import neem` reads again.
 
 Each node is a `DUL:Action` that executes a task of a class of SOMA, in its time interval in s since 1970; objects are
-participants, the robot is the performer, and their poses are transforms from the map. Streams that an import made of
-tf are transforms again. Observations, joints, percepts and attachments have no place in a NEEM.
+participants, the robot is the performer, and their poses are transforms from the map. Of the observations, the streams
+that an import made of tf are written, as transforms again. Other observations, joints, percepts and attachments have no
+place in a NEEM.
 
 What the vocabulary has no relation for (the type of a node, its exact status and times, its parameters) stands in
 triples of our own (`neem_vocabulary.OWN`), which KnowRob keeps and ignores, so that an import gives the same
-nodes, statuses, times and poses. Those of nodes are long, and stand with the annotations: KnowRob has an index over the
-objects of triples, and none over the values of annotations.
+nodes, statuses, times and poses. The texts of nodes are long, and so stand with the annotations: KnowRob indexes the
+objects of triples, and not the values of annotations.
 
 | file, each in a folder `roslog` | documents |
 |---|---|
-| `triples.bson` | s, p, o, the classes above (`p*`, `o*`), graph, scope |
+| `triples.bson` | s, p, o; `p*`, which is p; `o*`, the class o and those above it, or o; graph, scope |
 | `tf.bson` | one for each transform |
 | `annotations.bson` | s, p, v: labels, and what our memory knows about nodes |
 | `inferred.bson` | none |
@@ -53,13 +54,16 @@ _INDEXES: Final = {
 }
 """The indexes of KnowRob's collections, without that of `_id`."""
 _ANNOTATIONS: Final = (f"{RDFS}label", f"{OWN}node")
-"""The relations whose values stand in the collection of annotations: of KnowRob's own, the one that is written."""
+"""The relations that stand in the collection of annotations: the one of KnowRob's that is written, and ours."""
 _FOREVER: Final = {"time": {"since": 0.0, "until": float("inf")}}
 _CHANNELS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 class _Move(NamedTuple):
-    """A transform: UTC in ns, parent, child, position and quaternion; whether its time is exact in ns."""
+    """A transform: UTC in ns, parent, child, position and quaternion.
+
+    `is_own` is true for the pose of a recorded object, which is written with its time in ns, and false for a stream.
+    """
 
     at: int
     parent: str
@@ -94,7 +98,10 @@ class NeemEpisode(TracedEpisode):
         self.moves.append(_Move(at, pose.frame, child, (*pose.position, *pose.orientation)))
 
     def iri_of(self, identity: int) -> str:
-        """Return the IRI of an object; that of one from a NEEM has the same fragment as there."""
+        """Return the IRI of an object, whose fragment is its name as in the NEEM it came from.
+
+        Of several objects of one name, all but the first have a suffix.
+        """
         name = self.world.name_of(identity) or "object"
         same = [each for each, added in self.world.added.items() if added.name == name]
         suffix = "" if len(same) < 2 or same[0] == identity else f"_{_letters(identity)}"
@@ -219,7 +226,7 @@ def _concept_iri(concept: str) -> str:
 
 
 def _document(s: str, p: str, o: Any) -> dict[str, Any]:
-    """Return a triple as KnowRob stores it: with the classes above that of a type, and valid at all times."""
+    """Return a triple as KnowRob stores it: a type with the classes above it, and valid at all times."""
     above = [o]
     if p == RDF_TYPE:
         above = [_concept_iri(each) for each in ancestors(vocabulary.local(o))] or [o]

@@ -1,7 +1,8 @@
 """A watch evaluates the condition of a monitor, at intervals and before each node, and interrupts the monitored task.
 
-Plans that never suspend need the evaluation before each node, because no other task can interrupt them. A watch fires
-once, so that it does not interrupt the cleanup of the interrupted plan.
+A plan that never waits lets other tasks run every 20 ms at most, so that polling alone would interrupt it late: the
+condition is also evaluated before each node. A watch fires once, so that it does not interrupt the cleanup of the
+interrupted plan.
 """
 
 import asyncio
@@ -41,17 +42,23 @@ class Watch:
         return ExecutionContext((*outside.watches, self), outside.arbiter, outside.claim)
 
     async def check(self) -> None:
-        """Interrupt the task and raise `CancelledError` if the condition holds."""
+        """Interrupt the watched task and raise `CancelledError` if the condition holds or raises.
+
+        Do nothing if the watch has fired or the task has ended.
+        """
         holds, error = await self._evaluate()
         if holds and self._fire(error):
             raise asyncio.CancelledError("interrupted by a monitor")
 
     async def poll(self, interval_s: float) -> None:
-        """Evaluate the condition at intervals and interrupt the task when it holds; ends then or with the task."""
+        """Interrupt the watched task as soon as the condition holds; end then, or after the end of that task.
+
+        An `Event` is awaited; any other condition is evaluated at intervals.
+        """
         assert self._task is not None
         if isinstance(self._condition, asyncio.Event):
             await self._condition.wait()
-        # A condition may swallow the cancellation with which the monitor ends this task: check the task as well.
+        # The monitor cancels this polling task at the end, which a condition may swallow: look at the watched task too.
         while not (self.fired or self._task.done()):
             holds, error = await self._evaluate()
             if holds:
@@ -60,7 +67,7 @@ class Watch:
                 await asyncio.sleep(interval_s)
 
     async def _evaluate(self) -> tuple[bool, BaseException | None]:
-        """Return whether to interrupt, and the condition's exception if that is the cause; the monitor raises it."""
+        """Return whether to interrupt, and the exception that the condition raised, which the monitor raises later."""
         try:
             return await self._holds(), None
         except asyncio.CancelledError as raised:
@@ -74,8 +81,8 @@ class Watch:
     async def _holds(self) -> bool:
         """Evaluate the condition in the monitor's own context.
 
-        Nodes that the condition performs belong to the monitor's node and are not watched by it. A monitor outside a
-        simulation evaluates its condition outside it too, also when a node inside the simulation starts.
+        Nodes that the condition performs belong to the monitor's node and are not watched by it. If the operand
+        contains a simulation, the condition sees the world outside of it, even before a node inside it.
         """
         if isinstance(self._condition, asyncio.Event):
             return self._condition.is_set()

@@ -136,7 +136,7 @@ def test_a_robot_without_an_action_of_the_type_is_an_empty_answer(folder: Path) 
 
 
 WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
-    "name a type or features, for example `pycrorm recall PickUpAction arm=LEFT`": ([], {}),
+    "name a type or a feature to rank by: `pycrorm recall PickUpAction arm=LEFT`": ([], {}),
     "or add --like": (["only:arm=LEFT"], {}),
     "(FEATURE~NUMBER)": ([GRIP, "level=high"], {}),
     "'high' is not a number": ([GRIP, "level~high"], {}),
