@@ -19,17 +19,9 @@ from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, TablesPending
+from pycrorm_async.events import types as event_types
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    EpisodeTagged,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    with_poses,
-)
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.frames import TRIED
@@ -473,30 +465,32 @@ class Activity:
         if event.type not in _READ:
             return
         match happening_of(event):
-            case EpisodeStarted() as started:
+            case event_types.EpisodeStarted() as started:
                 self._start_ns = event.monotonic_ns
                 self._description, self.simulated = started.description[:_TEXT_MAX], started.simulated
                 self._plan, self._tags = started.plan or "", set(started.tags)
                 self._commit = commit_text(started.git_commit, is_dirty=started.git_dirty)
-            case EpisodeTagged() as tagged:
+            case event_types.EpisodeTagged() as tagged:
                 self._tags = (self._tags | set(tagged.added)) - set(tagged.removed)
-            case NodeStarted() as started:
+            case event_types.NodeStarted() as started:
                 self._nodes += 1
                 dtype = designators.get(started.designator or "", "")
-                self._parameters[event.sequence] = whole = with_poses(started.parameters, self._parameters.get)
+                self._parameters[event.sequence] = whole = event_types.with_poses(
+                    started.parameters, self._parameters.get
+                )
                 parameters = with_object_names(whole, lambda each: self._names.get(each["object"]))
                 node = _RunningNode(started.parent, dtype, started.kind == "action", event.monotonic_ns)
                 self._nodes_running[event.sequence] = node
                 self._running[event.sequence] = f"{dtype or started.kind} {parameters_text(parameters)}".strip()
-            case NodeEnded() as ended:
+            case event_types.NodeEnded() as ended:
                 self._node_ended(ended, event.monotonic_ns)
-            case ObjectAdded() as added:
+            case event_types.ObjectAdded() as added:
                 self._names[event.sequence] = added.name
                 if added.object_type == "ROBOT":
                     self._robots[added.name] = None
                 elif added.object_type != "ENVIRONMENT":
                     self._objects[added.name] = None
-            case EpisodeEnded() as ended_episode:
+            case event_types.EpisodeEnded() as ended_episode:
                 self._status, self._seconds = ended_episode.status, (event.monotonic_ns - self._start_ns) / 1e9
                 if ended_episode.status == "LOST":
                     self._failed += len(self._running)
@@ -505,7 +499,7 @@ class Activity:
             case _:
                 pass
 
-    def _node_ended(self, ended: NodeEnded, now_ns: int) -> None:
+    def _node_ended(self, ended: event_types.NodeEnded, now_ns: int) -> None:
         text = self._running.pop(ended.node, "")
         self._parameters.pop(ended.node, None)
         node = self._nodes_running.pop(ended.node, None)

@@ -23,16 +23,9 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
+from pycrorm_async import errors
 from pycrorm_async.bulk_records import make
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import (
-    CallerError,
-    DamageError,
-    DatabaseError,
-    DatabaseUnavailable,
-    LogDamaged,
-    UnknownEpisode,
-)
 from pycrorm_async.events.codec import Record, declaration_type, decode, encode, fingerprint, short_name
 from pycrorm_async.events.fields import changed_tags
 from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
@@ -138,12 +131,12 @@ async def _archived(lake: Lake, name: str, target: DatabaseAddress) -> EpisodeRo
     """Find an episode of a lake. Raises `UnknownEpisode`, of one that the target has erased with time and reason."""
     try:
         return lake.named(name)
-    except UnknownEpisode:
-        with suppress(DatabaseError):  # there may be no target yet
+    except errors.UnknownEpisode:
+        with suppress(errors.DatabaseError):  # there may be no target yet
             async with await EventLog.open(target, create=False) as log:
                 for each in await log.all_removed():
                     if each.archived_in is None and each.id.startswith(name.lower()):
-                        raise UnknownEpisode(str(each)) from None
+                        raise errors.UnknownEpisode(str(each)) from None
         raise
 
 
@@ -166,7 +159,7 @@ async def read_archived(lake: str, episodes: Sequence[str] = ()) -> AsyncIterato
         summary = await copy_episodes(lake, url, episodes=episodes)
         for each in summary.episodes:
             if fault := each.damage or each.stopped:
-                raise DamageError(f"{summary.source}: episode {each.id}: {fault}")
+                raise errors.DamageError(f"{summary.source}: episode {each.id}: {fault}")
         async with Reading.open(url) as reading:
             yield reading
 
@@ -177,7 +170,7 @@ async def _open_target(address: DatabaseAddress, source: Source) -> AsyncIterato
     placement = PLAIN if address.is_sqlite else Placement((await source.placement()).partitions)
     async with await EventLog.open(address, create=True, placement=placement) as log:
         if log.log_id == source.log_id:
-            raise CallerError(
+            raise errors.CallerError(
                 f"{source.address} and {address} are the same memory, or file copies of one memory: copy to a new URL"
             )
         log.blobs.source = source.blobs
@@ -232,7 +225,7 @@ class _Copier:
                     continue
                 try:
                     await self._copy(row, before.get(row.id, 0))
-                except DamageError as damage:
+                except errors.DamageError as damage:
                     self._damage[row.id] = str(damage)
                 if folding.done():  # it failed
                     break
@@ -299,7 +292,7 @@ class _Copier:
             for event in page:
                 if event[1:] != (await anext(others))[1:]:
                     reason = f"{self._target.address} has another event with this sequence than {self._source.address}"
-                    raise LogDamaged(shared.id, event.sequence, reason)
+                    raise errors.LogDamaged(shared.id, event.sequence, reason)
             self._progress(len(page))
 
     async def _numbered(self, lake: Lake, rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:
@@ -327,12 +320,12 @@ class _Copier:
         records = {episode: _records(episode, events) for episode, events in batch.items() if events}
         try:
             await self._append_at_once([*declarations, *chain.from_iterable(records.values())])
-        except DamageError:
+        except errors.DamageError:
             # The target refused the whole batch, because another process appended other events to one of the episodes.
             for episode, events in records.items():
                 try:
                     await self._append_at_once([*declarations, *events])
-                except DamageError as damage:
+                except errors.DamageError as damage:
                     self._damage[episode_text(episode)] = str(damage)
         self._appended.set()
 
@@ -381,7 +374,7 @@ def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
         else:
             msgspec.json.decode(event.payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
+        raise errors.LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
 
 
 class _CopiedType(msgspec.Struct):
@@ -453,7 +446,7 @@ async def tag_episode(
                 visible = await _fold(log, row)
                 return TaggedEpisode(row.number, row.id, tuple(sorted(tags)), visible)
             row = await episode_named(log, row.id)
-        raise DatabaseUnavailable(f"{address}: other processes tag episode {row.number} all the time; try again")
+        raise errors.DatabaseUnavailable(f"{address}: other processes tag episode {row.number} all the time; try again")
     finally:
         await log.close()
 
@@ -461,12 +454,14 @@ async def tag_episode(
 async def _append(log: EventLog, row: EpisodeRow, event: EpisodeTagged, clock: Clock) -> bool:
     """Append behind the episode's last event; False if another process did so first."""
     if row.ended_wall_ns is None:
-        raise CallerError(
+        raise errors.CallerError(
             f"episode {row.number} has not ended: tag it in the process that records it (`memory.tag`);"
             " if that died, run `pycrorm writer --once` first"
         )
     if row.refused is not None:
-        raise CallerError(f"episode {row.number} cannot be tagged, because events of it are missing: {row.refused}")
+        raise errors.CallerError(
+            f"episode {row.number} cannot be tagged, because events of it are missing: {row.refused}"
+        )
     (last,) = await log.events(row.number, after=row.head - 1, limit=1)
     # No time passes on the recorder's monotonic clock any more, and this process may have another one.
     wall_ns, monotonic_ns = clock.wall_ns(), last.monotonic_ns
@@ -474,13 +469,13 @@ async def _append(log: EventLog, row: EpisodeRow, event: EpisodeTagged, clock: C
     record = Record(0, episode, row.head + 1, kind.__name__, kind.version, wall_ns, monotonic_ns, encode(event))
     try:
         refusals = await log.append([record])
-    except LogDamaged:
+    except errors.LogDamaged:
         now = await log.episode(episode)
         if now is None or now.head == row.head:
             raise
         return False
     if refusals:
-        raise DatabaseUnavailable(f"{log.address}: episode {row.number}: {refusals[episode]}")
+        raise errors.DatabaseUnavailable(f"{log.address}: episode {row.number}: {refusals[episode]}")
     return True
 
 
@@ -492,7 +487,7 @@ async def _fold(log: EventLog, row: EpisodeRow) -> bool:
         while row.id in await destination.behind():
             await retry(destination.fold_next_batch, backoff=BRIEF)
         return row.id not in await destination.stopped()
-    except DatabaseError:
+    except errors.DatabaseError:
         return False
     finally:
         await destination.group.leave()

@@ -37,18 +37,10 @@ from pycrorm_async.query.question import AskedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall import cases as case_rows
-from pycrorm_async.recall import search
+from pycrorm_async.recall import prediction, search
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import CaseBlock, CaseLibrary, merge
 from pycrorm_async.recall.columns import RESERVED, Case
-from pycrorm_async.recall.prediction import (
-    Prediction,
-    Situation,
-    predict,
-    present_situation,
-    situations_of,
-    unlike_rollouts,
-)
 from pycrorm_async.recall.search import dtype_of
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.task_status import TaskStatus
@@ -173,7 +165,7 @@ class Recall:
         """
         dtype = dtype_of(action)
         library = await self._reader.library(dtype, aliases_of(action))
-        symbols, numbers = present_situation(target, action)
+        symbols, numbers = prediction.present_situation(target, action)
         features = library.texts(dtype) | library.numbers(dtype)
         symbols = {name: each for name, each in symbols.items() if name in features and name != "object_name"}
         wanted = {name: each for name, each in numbers.items() if name in features}
@@ -187,7 +179,7 @@ class Recall:
         *,
         has: Mapping[str, Any] = _NOTHING,
         near: Mapping[str, Any] = _NOTHING,
-    ) -> Prediction:
+    ) -> prediction.Prediction:
         """Predict the outcome of an action that would begin now, from the tries most like it (`recall.prediction`).
 
         Args:
@@ -211,16 +203,16 @@ class Recall:
         library = await self._reader.library(dtype, aliases_of(action))
         words, numbers = search.symbols_of(has), search.numbers_of(near)
         search.check_cue(search.Cue(type=dtype, has=words, near=numbers), library)
-        return predict(library, [Situation(dtype, dict(words), numbers)])[0]
+        return prediction.predict(library, [prediction.Situation(dtype, dict(words), numbers)])[0]
 
-    async def predictions(self, actions: Sequence[Designator]) -> list[Prediction]:
+    async def predictions(self, actions: Sequence[Designator]) -> list[prediction.Prediction]:
         """Predict the outcome of each of these designators, as if it began now."""
-        situations = situations_of(actions)
+        situations = prediction.situations_of(actions)
         library = CaseLibrary()
         for dtype, kind in {each.type: type(action) for each, action in zip(situations, actions, strict=True)}.items():
             aliases = aliases_of(kind) if kind.__dtype__ == dtype else ()
             library = await self._reader.library(dtype, aliases)
-        return predict(library, situations, unlike_rollouts(await self._rollouts(library)))
+        return prediction.predict(library, situations, prediction.unlike_rollouts(await self._rollouts(library)))
 
     async def _rollouts(self, library: CaseLibrary) -> Sequence[tuple[int, int, str | None]]:
         """Return the stored batches of rollouts: the node, the lowest id after its end, and the scene."""

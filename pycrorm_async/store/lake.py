@@ -25,17 +25,9 @@ from itertools import chain, groupby, islice, repeat
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from pycrorm_async import errors
 from pycrorm_async.bulk_records import make
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import (
-    CallerError,
-    DatabaseForeign,
-    DatabaseUnavailable,
-    LogDamaged,
-    MissingExtra,
-    QueryRefused,
-    UnknownEpisode,
-)
 from pycrorm_async.events.ids import SEQUENCE_MAX
 from pycrorm_async.events.types import references_in
 from pycrorm_async.store.address import DatabaseAddress
@@ -92,9 +84,9 @@ def open_lake(address: str, *, write: bool = False) -> Any:
         try:
             Path(place).parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DatabaseUnavailable(f"{address}: the folder cannot be made: {error.strerror}") from error
+            raise errors.DatabaseUnavailable(f"{address}: the folder cannot be made: {error.strerror}") from error
     elif catalog == "sqlite" and not Path(place).exists():
-        raise DatabaseUnavailable(f"{address}: there is no lake: `pycrorm archive --to {address}` makes one")
+        raise errors.DatabaseUnavailable(f"{address}: there is no lake: `pycrorm archive --to {address}` makes one")
     options = ["DATA_INLINING_ROW_LIMIT 0", *([f"DATA_PATH '{_quoted(data)}'"] if data else [])]
     options += [] if write else ["READ_ONLY"]
     options += ["META_BUSY_TIMEOUT 30000"] if catalog == "sqlite" else []  # ms; other archives commit meanwhile
@@ -116,7 +108,7 @@ def open_lake(address: str, *, write: bool = False) -> Any:
             return connection
         connection.close()
         break
-    raise DatabaseForeign(f"{shown(address)} {fault}")
+    raise errors.DatabaseForeign(f"{shown(address)} {fault}")
 
 
 def check_present(address: str) -> None:
@@ -125,20 +117,22 @@ def check_present(address: str) -> None:
     for each in (place if catalog == "sqlite" else "", "" if "://" in data else data):
         if each and not Path(each).exists():
             advice = f"is away: mount {each}, or name another lake"
-            raise DatabaseUnavailable(f"{shown(address)} has episodes of this memory, and {advice}")
+            raise errors.DatabaseUnavailable(f"{shown(address)} has episodes of this memory, and {advice}")
 
 
 def _parsed(address: str) -> tuple[str, str, str]:
     """Return the kind of the catalog, its place, and the folder of the data. Raises `CallerError`."""
     place, _, data = address.removeprefix(PREFIX).partition("#")
     if not address.startswith(PREFIX) or not place:
-        raise CallerError("a lake is named ducklake:FOLDER, or ducklake:postgresql://user@host/database#FOLDER")
+        raise errors.CallerError("a lake is named ducklake:FOLDER, or ducklake:postgresql://user@host/database#FOLDER")
     if place.startswith(("postgresql:", "postgres:")):
         return "postgres", place, data
     if "://" in place:
-        raise CallerError(f"a lake has its catalog in a folder or on PostgreSQL, not at {place.partition('://')[0]}://")
+        raise errors.CallerError(
+            f"a lake has its catalog in a folder or on PostgreSQL, not at {place.partition('://')[0]}://"
+        )
     if "#" in address:
-        raise CallerError(f"a lake in a folder has its data there: leave out #{data}")
+        raise errors.CallerError(f"a lake in a folder has its data there: leave out #{data}")
     folder = Path(place).absolute()
     return "sqlite", f"{folder}/catalog.sqlite", f"{folder}/data"
 
@@ -150,7 +144,7 @@ def _connect(*extensions: str) -> Any:
         wheels = [import_module(f"duckdb_extension_{each}") for each in extensions]
         import_module("pyarrow")
     except ImportError as error:
-        raise MissingExtra(f"a lake needs DuckDB ({error.name}): pip install 'pycrorm-async[lake]'") from None
+        raise errors.MissingExtra(f"a lake needs DuckDB ({error.name}): pip install 'pycrorm-async[lake]'") from None
     connection = duckdb.connect(config={"allow_unsigned_extensions": True, "autoinstall_known_extensions": False})
     connection.execute("SET enable_progress_bar = false")  # it would be among the rows on stdout, after two seconds
     for wheel in wheels:
@@ -167,9 +161,9 @@ def _refuse_other_program(address: str, catalog: Path) -> None:
         with closing(sqlite3.connect(f"{catalog.as_uri()}?mode=ro", uri=True)) as connection:
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
     except sqlite3.DatabaseError as error:
-        raise DatabaseForeign(f"{shown(address)}: {catalog.name} is no catalog of a lake: {error}") from None
+        raise errors.DatabaseForeign(f"{shown(address)}: {catalog.name} is no catalog of a lake: {error}") from None
     if tables and "ducklake_metadata" not in tables:
-        raise DatabaseForeign(f"{shown(address)}: {catalog.name} is a database of another program")
+        raise errors.DatabaseForeign(f"{shown(address)}: {catalog.name} is a database of another program")
 
 
 def _prepare(connection: Any, *, write: bool) -> str | None:
@@ -210,9 +204,9 @@ def shown(address: str) -> str:
     return f"{PREFIX}{DatabaseAddress.parse(place).to_type}{f'#{data}' if data else ''}"
 
 
-def unavailable(address: str, error: Exception) -> DatabaseUnavailable:
+def unavailable(address: str, error: Exception) -> errors.DatabaseUnavailable:
     """Return the error to raise instead of one of DuckDB, whose further lines may have a password."""
-    return DatabaseUnavailable(f"{shown(address)}: {_first_line(error, address)}")
+    return errors.DatabaseUnavailable(f"{shown(address)}: {_first_line(error, address)}")
 
 
 def _first_line(error: Exception, address: str) -> str:
@@ -309,10 +303,10 @@ class Lake:
         rows = self.episode_rows(ids)
         if not rows:
             for identity, why in self._erased(begins).items():
-                raise UnknownEpisode(f"{self.address}: episode {identity} was erased on {why}")
+                raise errors.UnknownEpisode(f"{self.address}: episode {identity} was erased on {why}")
         if len(rows) != 1:
             how = "no episode has" if not rows else f"{len(rows)} episodes have"
-            raise UnknownEpisode(f"{self.address}: {how} an id that begins with {name!r}")
+            raise errors.UnknownEpisode(f"{self.address}: {how} an id that begins with {name!r}")
         [episode] = rows.values()
         return episode.row
 
@@ -326,7 +320,7 @@ class Lake:
         for first in range(after, len(events), _PAGE_EVENTS):
             yield events[first : first + _PAGE_EVENTS]
         if len(events) < episode.head:
-            raise LogDamaged(episode.id, len(events) + 1, f"is missing in {self.address}")
+            raise errors.LogDamaged(episode.id, len(events) + 1, f"is missing in {self.address}")
 
     async def is_intact(self, episode: EpisodeRow) -> bool:
         """Return whether the events of an episode have the digest that they had in the memory that archived them."""
@@ -410,7 +404,7 @@ class Lake:
             self._insert("blob", [(name, *blob) for name, blob in blobs.items()])
             self.execute("COMMIT")
         except BaseException:  # an interruption too
-            with suppress(DatabaseUnavailable):
+            with suppress(errors.DatabaseUnavailable):
                 self.execute("ROLLBACK")
             raise
         if erased := self.erased(ids):
@@ -481,7 +475,7 @@ class Lake:
     def _heads_in(self, file: Path) -> dict[str, int] | None:
         """Return the last event of each episode in a file of events; None for one that was not written to its end."""
         query = f"SELECT episode::VARCHAR, max(sequence) FROM read_parquet('{_quoted(str(file))}') GROUP BY 1"
-        with suppress(DatabaseUnavailable):
+        with suppress(errors.DatabaseUnavailable):
             return dict(self.execute(query))
         return None
 
@@ -567,8 +561,8 @@ def query_lake(address: str, sql: str) -> tuple[tuple[str, ...], list[tuple[Any,
         try:
             statements = connection.extract_statements(sql)
             if [each.type.name for each in statements] not in (["SELECT"], ["EXPLAIN"]):
-                raise QueryRefused(f"{shown(address)}: give one query that only reads, such as SELECT")
+                raise errors.QueryRefused(f"{shown(address)}: give one query that only reads, such as SELECT")
             answer = connection.execute(statements[0])
             return tuple(each[0] for each in answer.description), answer.fetchall()
         except import_module("duckdb").Error as error:
-            raise QueryRefused(f"{shown(address)}: {_first_line(error, address)}") from error
+            raise errors.QueryRefused(f"{shown(address)}: {_first_line(error, address)}") from error

@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "pycrorm_async"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-CODE_LINES_MAX = 56_130
+CODE_LINES_MAX = 56_105
 """Bounds the lines of code of the package: lower it when it gets smaller. Only a feature may raise it, by what it
 adds: engines of worlds 650, imports and the exports that mirror them 4,300, the compiled core and cheap starts 950,
 partitions, shards and shared folds 900, erasure and the lake 1,200, pages of a fleet and of pictures 1,000; poolers,
@@ -22,7 +22,7 @@ replicas, rules of retention and clusters 1,000, cameras, lanes, videos and mesh
 columns 100, success models, policies in the memory, predictions, whole tasks and worlds that fail 2,600, other robots
 that learn and searches near tables 400, copies and archives on two cores and a server that stores while the next batch
 is read 210, by which the rest got smaller at the same time; robot files and logs that were read wrong 250."""
-IMPORT_LINES_MAX = 4_519
+IMPORT_LINES_MAX = 4_488
 """Bounds those of them that are import statements; 4 to 9 % of all are usual in packages of this size."""
 FILE_LINES_MAX = 900
 CIRCLES = {
