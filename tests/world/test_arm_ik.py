@@ -62,7 +62,7 @@ def test_a_target_that_a_posture_within_limits_reaches_is_solved_exactly_within_
         reached_pose = reached(arm, answer, base=base, torso_height=torso_height)
         assert reached_pose.distance(target) < EXACT
         assert angle_between(reached_pose.orientation, target.orientation) < EXACT
-        margin, one_step = least_margin(arm, answer, limits), 0.05
+        margin, one_step = least_margin(arm, answer, limits), 0.1  # rad; other joints turn farther than the one tried
         assert margin >= 0
         assert margin > least_margin(arm, joints, limits) - one_step  # as far from the limits as any other posture
         assert tuple(answer) == PR2.arms[arm].joints
