@@ -18,25 +18,19 @@ from pycrorm_async.world.urdf import PR2
 MILK = Pose((1.3, 1.0, 0.9))
 
 
-def failed_goal(choice: PickUpChoice, milk: Pose = MILK) -> int | None:
-    """Return the number of the first goal that the hand of a PR2 cannot reach, None if it picks the milk up.
-
-    It faces the milk from there, arms stretched ahead; its torso is down, or as the choice has it.
+def succeeds(choice: PickUpChoice, milk: Pose = MILK) -> bool:
+    """Return whether a PR2 that faces the milk from there, arms stretched ahead, picks it up; its torso is down, or as
+    the choice has it.
     """
     floor = milk @ Pose((choice.relative_x, choice.relative_y, -milk.position.z))
     ahead = math.atan2(milk.position.y - floor.position.y, milk.position.x - floor.position.x)
     base = Pose(floor.position, yaw_quaternion(ahead))
-    for number, goal in enumerate(pick_up_poses(PR2, milk, choice.grasp, base)):
-        try:
+    try:
+        for goal in pick_up_poses(PR2, milk, choice.grasp, base):
             solve_from(PR2, choice.arm, goal, base=base, torso_height=choice.torso or 0.0)
-        except Unreachable:
-            return number
-    return None
-
-
-def succeeds(choice: PickUpChoice, milk: Pose = MILK) -> bool:
-    """Return whether the pick-up succeeds."""
-    return failed_goal(choice, milk) is None
+    except Unreachable:
+        return False
+    return True
 
 
 def frame_of(choices: Iterable[PickUpChoice]) -> pd.DataFrame:

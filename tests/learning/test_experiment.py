@@ -12,16 +12,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import psutil
 import pytest
 
 from pycrorm_async import Reading, recover
 from pycrorm_async.errors import CallerError, NotEnoughExperience
-from pycrorm_async.learning import Scene, default_policy, name_of
+from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of
 from pycrorm_async.learning.experiment import (
     Experiment,
     ExperimentResult,
-    coverage_of,
     pick_up_in_kitchen,
     read_rollouts,
     run,
@@ -30,6 +30,7 @@ from pycrorm_async.learning.experiment import (
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.pool import MemoryLocation, RolloutTask, WorkerLost, Workers
 from pycrorm_async.learning.rollouts import Tally, batch_rollout
+from pycrorm_async.learning.tree import learn
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
@@ -37,6 +38,8 @@ from tests.databases import ask, await_events
 pytestmark = pytest.mark.slow
 
 SMALL = Experiment(rollouts=600, evaluate=100, held_out=100, workers=2)
+LONGER = Experiment(rollouts=600, evaluate=50, held_out=50, workers=2)
+"""At its first report most of it must remain, also when the machine is busy and reports are read late."""
 
 
 @pytest.fixture
@@ -49,7 +52,7 @@ def workers_running() -> list[psutil.Process]:
     return [worker for each in servers for worker in each.children()]
 
 
-def after(rollouts: int, act: Callable[[], object]) -> Callable[[str, int, int, Tally], None]:
+def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Tally], None]:
     """Return a progress callback that acts once, when this many rollouts are done."""
     acted = False
 
@@ -83,8 +86,7 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     everything = sum(each.tally.rollouts for each in learned.phases)
     assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
 
-    with pytest.raises(CallerError, match=r"600 rollouts .* recorded already .* --resume"):
-        await run(SMALL, place)
+    await fails_without_resume(place)
     again = await run(replace(SMALL, resume=True, workers=1), place)
     assert again.policy == learned.policy
     assert [each.done_now for each in again.phases] == [0, 0, 0]
@@ -107,6 +109,11 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     assert [each.dtype for each in tree].count("MoveAndPickUpAction") == picked.tries
 
 
+async def fails_without_resume(place: MemoryLocation) -> None:
+    with pytest.raises(CallerError, match=r"600 rollouts .* recorded already .* --resume"):
+        await run(SMALL, place)
+
+
 async def finished(experiment: Experiment, place: MemoryLocation) -> ExperimentResult:
     """Compare what is left of it with an experiment that was not disturbed."""
     learned = await run(replace(experiment, resume=True, workers=1), place)
@@ -123,17 +130,21 @@ async def finished(experiment: Experiment, place: MemoryLocation) -> ExperimentR
     return learned
 
 
+def kill_one() -> None:
+    workers_running()[0].kill()
+
+
 @pytest.mark.soak
 async def test_a_killed_worker_is_reported_and_resuming_loses_and_doubles_nothing(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(WorkerLost, match="a rollout worker was killed by SIGKILL; its finished rollouts are recorded"):
-        await run(SMALL, place, after(1, lambda: [each.kill() for each in workers_running()[:1]]))
+        await run(LONGER, place, after(1, kill_one))
     assert not workers_running()
     await recover(place.url)  # stores what the killed worker's spool still holds, as resuming does
     async with Reading.open(place.url) as reading:
         before = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 600)
     assert 0 < len(before) < 600
-    learned = await finished(SMALL, place)
+    learned = await finished(LONGER, place)
     assert learned.default.done_now == 600 - len(before)
 
 
@@ -147,12 +158,12 @@ async def test_interrupted_workers_finish_their_current_rollout_and_the_experime
     def interrupt() -> None:
         task.cancel()
 
-    task = asyncio.create_task(run(SMALL, place, after(1, interrupt)))
+    task = asyncio.create_task(run(LONGER, place, after(1, interrupt)))
     with pytest.raises(asyncio.CancelledError):
         await task
     assert not workers_running()
     assert ask(place.url, "SELECT status FROM process_metadata WHERE status <> 'SUCCEEDED'") == []
-    learned = await finished(SMALL, place)
+    learned = await finished(LONGER, place)
     assert 0 < learned.default.done_now < 600
 
 
@@ -186,6 +197,15 @@ async def test_the_drainer_may_exit_and_later_records_are_drained_too(tmp_path: 
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
 
 
+@pytest.mark.soak
+async def test_of_two_experiments_on_one_memory_the_first_to_end_leaves_the_other_running(tmp_path: Path) -> None:
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    small = replace(SMALL, rollouts=150, evaluate=20, held_out=60, workers=1, min_samples_leaf=5)
+    first, second = await asyncio.gather(run(small, place), run(replace(small, seed=70, rollouts=500), place))
+    assert [each.tally.rollouts for each in first.phases] == [150, 20, 60]
+    assert [each.tally.rollouts for each in second.phases] == [500, 20, 60]
+
+
 async def test_workers_that_are_not_free_take_no_job() -> None:
     job = RolloutTask(Scene(), default_policy(), 5, recorded=False)
     workers = Workers(1, None)
@@ -203,6 +223,31 @@ async def test_workers_that_are_not_free_take_no_job() -> None:
             await workers.roll_out(job, [(0, 5)])
 
 
+@pytest.mark.soak
+async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tmp_path: Path) -> None:
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    tiny = replace(SMALL, rollouts=150, evaluate=20, held_out=1, workers=1, min_samples_leaf=5)
+    learned = await run(tiny, place)
+    assert learned.held_out.tally.successes == 0
+    assert learned.coverage is None
+
+
+@pytest.mark.soak  # the first test makes a study, and rollouts beyond those of the experiment are read below
+async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There are 500 rollouts here, but not all of them among the first 500."""
+    monkeypatch.setattr("pycrorm_async.learning.experiment.scene_variants", lambda _scene: ())
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    async with Workers(1, place) as workers:
+        await workers.roll_out(RolloutTask(Scene(), default_policy(), 69), [(400, 200)])
+    small = replace(SMALL, rollouts=300, evaluate=20, held_out=60, workers=1, min_samples_leaf=5, resume=True)
+    learned = await run(small, place)
+    assert learned.default.tally.rollouts == 300
+    studied = await study(small, learned, place, rollouts=5, report_progress=lambda *_: None)
+    assert studied.curve == ()
+
+
 async def test_too_few_successes_are_reported_and_all_rollouts_kept(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(NotEnoughExperience, match=r"too few to learn from: a leaf takes 25; .* --min-samples-leaf"):
@@ -210,7 +255,37 @@ async def test_too_few_successes_are_reported_and_all_rollouts_kept(tmp_path: Pa
     async with Reading.open(place.url) as reading:
         frame = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 700)
     assert len(frame) == 40
-    assert coverage_of(frame[frame.status == "FAILED"], default_policy()) is None
+
+
+@pytest.mark.soak  # test_policy learns in two rounds too
+async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Path) -> None:
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    learned = await run(replace(SMALL, rounds=2, workers=1, evaluate=200, held_out=100, rollouts=600), place)
+    assert [each.name for each in learned.phases][:3] == ["default policy", "learned policy, round 2", "learned policy"]
+    assert len(learned.successes) == learned.phases[0].tally.successes + learned.phases[1].tally.successes
+    assert learned.evaluation.tally.success_rate > 0.5
+
+
+@pytest.mark.soak  # the first test resumes too
+async def test_rollouts_are_not_repeated_when_learning_from_them_had_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    twice = Experiment(rollouts=200, rounds=2, evaluate=10, held_out=10, workers=1)
+    learned_from: list[int] = []
+
+    def learn_once(successes: pd.DataFrame, *, min_samples_leaf: int) -> Policy:
+        learned_from.append(len(successes))
+        if len(learned_from) == 2:
+            raise RecursionError("maximum recursion depth exceeded")
+        return learn(successes, min_samples_leaf=min_samples_leaf)
+
+    monkeypatch.setattr(experiment, "learn", learn_once)
+    with pytest.raises(RecursionError):
+        await run(twice, place)
+    learned = await run(replace(twice, resume=True), place)
+    assert [(each.tally.rollouts, each.done_now) for each in learned.phases] == [(200, 0), (200, 0), (10, 10), (10, 10)]
+    assert learned_from[2:] == learned_from[:2]
 
 
 async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from pycrorm_async.errors import CallerError, ImpossibleCondition
 from pycrorm_async.learning import (
     MoveAndPickUp,
     Policy,
-    PredictedPickUpPerformable,
     RecalledPickUp,
     RecalledPickUpPerformable,
     Rectangle,
@@ -36,6 +35,7 @@ from pycrorm_async.orm import Action
 from pycrorm_async.plan import MoveTCPMotion, Retry, Sequential, simulated_robot
 from pycrorm_async.plan.failures import (
     ManipulationGoalInCollision,
+    NoRobotHere,
     NotResolved,
     ObjectUnreachable,
     PlanFailure,
@@ -128,11 +128,8 @@ async def test_a_robot_with_one_arm_gets_no_samples_of_the_other() -> None:
     with BulletWorld(), simulated_robot:
         Object("courier", ObjectType.ROBOT)
         milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.6]))
-        untrained = MoveAndPickUp(milk, policy=SuccessModel.untrained(), samples=3)
-        ways = [*untrained, *MoveAndPickUp(milk)]
-        assert {each.arm for each in ways} == {Arms.RIGHT}
-        assert untrained.height == pytest.approx(0.6)  # over its base
-        assert [each.torso for each in ways if isinstance(each, PredictedPickUpPerformable)] == [None] * 3
+        for ways in (MoveAndPickUp(milk), MoveAndPickUp(milk, policy=SuccessModel.untrained())):
+            assert {each.arm for each in ways} == {Arms.RIGHT}
         assert {each.arm for each in MoveAndPickUp(milk, [Arms.LEFT]).plain()} == {Arms.LEFT}  # fails with the reason
         async with Memory.open("sqlite://"):
             assert {each.arm async for each in RecalledPickUp(milk)} == {Arms.RIGHT}
@@ -223,6 +220,7 @@ async def test_a_held_object_counts_as_the_arm_does() -> None:
     with Scene(collisions=True).entered() as there:
         await MoveAndPickUp(there.target).chosen(PickUpChoice(Arms.LEFT, Grasp.FRONT, -0.67, 0.0)).perform()
         goal = there.robot.link_pose("l_gripper_tool_frame")
+        await MoveTCPMotion(goal, Arms.LEFT, allow_gripper_collision=True).perform()
         Object("another", ObjectType.MILK, pose=there.target.pose)
         with pytest.raises(ManipulationGoalInCollision, match="would be in another with milk"):
             await MoveTCPMotion(goal, Arms.LEFT, allow_gripper_collision=True).perform()
@@ -244,10 +242,11 @@ def test_cells_become_rectangles_that_cover_them_once() -> None:
     assert not list(rectangles(np.zeros((80, 80), dtype=bool)))
 
 
-def test_a_rotated_object_has_the_same_grounded_places_in_the_map() -> None:
+@pytest.mark.parametrize("yaw", [math.pi / 2, 0.7])
+def test_a_rotated_object_has_the_same_grounded_places_in_the_map(yaw: float) -> None:
     east, north = np.random.default_rng(1).uniform(-1.4, 1.4, (2, 4_000))
     inside = []
-    for turn in (0.0, 0.7):
+    for turn in (0.0, yaw):
         with Scene(kitchen=True, torso_height=0.3, yaw=turn).entered() as there:
             region = free_and_visible(require_robot(), there.target)
             x = math.cos(turn) * east + math.sin(turn) * north
@@ -255,6 +254,13 @@ def test_a_rotated_object_has_the_same_grounded_places_in_the_map() -> None:
             inside.append(region.contains(x, y))
     assert 0.1 < inside[0].mean() < 0.9
     assert (inside[0] == inside[1]).mean() > 0.95  # but for cells on the edges
+
+
+def test_without_a_world_or_a_robot_an_error_is_raised() -> None:
+    with BulletWorld():
+        milk = Object("milk", ObjectType.MILK)
+        with pytest.raises(NoRobotHere, match="no robot in the world"):
+            MoveAndPickUp(milk).resolve()
 
 
 # === default policy ===========================================================================================
@@ -299,6 +305,12 @@ def test_its_mode_is_the_four_places_next_to_the_hole() -> None:
         (-0.025, 0.025, -0.25, -0.2),
         (-0.025, 0.025, 0.2, 0.25),
     }
+
+
+def test_the_policy_is_the_same_at_every_height() -> None:
+    conditioned = default_policy().condition(Evidence(height=(0.5, 0.6)))
+    choices = default_policy().sample(np.random.default_rng(4), 10)
+    assert conditioned.likelihood(choices).tolist() == default_policy().likelihood(choices).tolist()
 
 
 # === recalled pick up =========================================================================================

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -16,7 +16,6 @@ from pycrorm_async.learning import Disturbance, MoveAndPickUp, PickUpChoice, Sce
 from pycrorm_async.plan import MoveAndPickUpPerformable, PlanFailure
 from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.world import Arms, Grasp, ObjectType
-from pycrorm_async.world.urdf import Limits
 
 TABLES = Scene(
     heights=(0.6, 1.1), turned=True, others=(ObjectType.BREAKFAST_CEREAL,), table=True, collisions=True,
@@ -50,9 +49,14 @@ async def test_seed_and_index_determine_table_object_and_errors_in_any_world() -
     assert {name for _, name, _ in whole.values()} == {"milk", "breakfast_cereal"}
     kinds = " ".join(failure for _, _, failure in whole.values())
     assert "base would be in table" in kinds
-    calm = await ends_of(replace(TABLES, disturbance=Disturbance()), [(0, 60)])
-    assert [each[:2] for each in calm.values()] == [each[:2] for each in whole.values()]  # the same choices
-    assert calm != whole
+
+
+@pytest.mark.slow
+async def test_disturbing_the_robot_changes_no_choice_of_the_policy() -> None:
+    calm = await ends_of(replace(TABLES, disturbance=Disturbance()), [(0, 30)])
+    disturbed = await ends_of(TABLES, [(0, 30)])
+    assert [each[:2] for each in calm.values()] == [each[:2] for each in disturbed.values()]
+    assert calm != disturbed
 
 
 async def test_what_varies_stays_within_its_limits_and_on_the_table() -> None:
@@ -146,9 +150,6 @@ def test_a_scene_without_variation_keeps_its_description_and_any_other_adds_to_i
     assert str(Scene()) == "milk at 1.3, 1, 0.9 m, torso at 0 m, soft limits"
     assert not Scene().varies
     variants = [
-        Scene(object_type=ObjectType.BOWL), Scene(name="bowl", object_type=ObjectType.BOWL),
-        Scene(position=(1.3, 1.0, 0.900001)), Scene(yaw=1e-5), Scene(yaw=1.00001e-5), Scene(torso_height=0.3),
-        Scene(limits=Limits.HARD), Scene(collisions=True), Scene(kitchen=True),
         Scene(heights=(0.6, 1.2)), Scene(turned=True), Scene(table=True), Scene(parked=True), TABLES,
         Scene(others=(ObjectType.BREAKFAST_CEREAL,)), Scene(disturbance=Disturbance(base_m=0.02)),
         Scene(disturbance=Disturbance(object_m=0.02)), Scene(disturbance=Disturbance(slip=0.02)),
@@ -156,19 +157,17 @@ def test_a_scene_without_variation_keeps_its_description_and_any_other_adds_to_i
     assert len({str(Scene()), *map(str, variants)}) == len(variants) + 1
 
 
-@pytest.mark.parametrize(
-    ("make", "reason"),
-    [
-        (lambda: Disturbance(base_m=-0.1), "base_m of a disturbance must be"),
-        (lambda: Disturbance(slip=1.5), "slip of a disturbance must be"),
-        (lambda: Disturbance(object_rad=math.nan), "object_rad of a disturbance must be"),
-        (lambda: Scene(heights=(1.2, 0.6)), "heights of a scene are an interval"),
-        (lambda: Scene(table=True, kitchen=True), "a table or the kitchen, not both"),
-    ],
-)
-def test_an_impossible_scene_or_disturbance_is_refused(make: Callable[[], object], reason: str) -> None:
-    with pytest.raises(CallerError, match=reason):
-        make()
+@pytest.mark.parametrize("wrong", [{"base_m": -0.1}, {"slip": 1.5}, {"object_rad": float("nan")}])
+def test_an_impossible_disturbance_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(CallerError, match=f"{next(iter(wrong))} of a disturbance must be"):
+        Disturbance(**wrong)
+
+
+def test_an_impossible_scene_is_refused() -> None:
+    with pytest.raises(CallerError, match="heights of a scene are an interval"):
+        Scene(heights=(1.2, 0.6))
+    with pytest.raises(CallerError, match="a table or the kitchen, not both"):
+        Scene(table=True, kitchen=True)
 
 
 def test_a_robot_arrives_facing_the_object_where_collisions_count() -> None:

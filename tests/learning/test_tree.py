@@ -73,6 +73,13 @@ def test_a_learned_policy_succeeds_far_more_often_than_the_default_one(
     assert np.mean([succeeds(each) for each in tries]) > 0.5
 
 
+def test_its_mode_succeeds_more_often_still(learned: Policy) -> None:
+    mode = learned.mode()
+    tries = mode.sample(np.random.default_rng(1), 200)
+    assert len({each[:2] for each in tries}) == 1
+    assert np.mean([succeeds(each) for each in tries]) > 0.9
+
+
 def test_all_successes_it_learned_from_are_possible_and_regions_without_one_are_not(
     learned: Policy, successes: list[PickUpChoice]
 ) -> None:
@@ -93,6 +100,10 @@ def test_the_leaves_equal_those_of_pyjpt_in_order_and_to_the_digit(learned: Poli
     ours = [(each.weight, each.arms, each.grasps, each.x.knots, each.y.knots) for each in learned.leaves]  # type: ignore[union-attr]
     assert len(ours) > 5
     assert ours == theirs
+
+
+def test_learning_again_yields_the_same_policy(learned: Policy, successes: list[PickUpChoice]) -> None:
+    assert learn(frame_of(successes)) == learned
 
 
 FIRST_OF_ALL = """
@@ -202,14 +213,19 @@ def test_every_frame_of_repeated_and_isolated_values_is_learned_whole(seed: int)
         ({"grasp": ["TOP"] * 29 + [None]}, "column grasp holds nan"),
         ({"object_x": [0.1] * 28 + [math.nan, math.inf]}, "object_x has no finite number in 2 of 30 rows"),
         ({"object_y": ["near"] * 30}, "column object_y holds values that are not numbers"),
-        ({"object_x": None}, "the frame has no column object_x: select arm, grasp, object_x, object_y"),
         ({"height": [None] * 30}, "height has no finite number in 30 of 30 rows"),
     ],
 )
 def test_invalid_successes_are_refused_by_name(change: dict[str, Any], said: str) -> None:
     with pytest.raises(CallerError) as raised:
-        learn(pd.DataFrame({name: values for name, values in (ALIKE | change).items() if values is not None}))
+        learn(pd.DataFrame(ALIKE | change))
     assert said in str(raised.value)
+
+
+def test_a_missing_column_is_named() -> None:
+    frame = pd.DataFrame(ALIKE).rename(columns={"object_x": "relative_x"})
+    with pytest.raises(CallerError, match="the frame has no column object_x: select arm, grasp, object_x, object_y"):
+        learn(frame)
 
 
 def test_too_few_successes_are_no_experience() -> None:
