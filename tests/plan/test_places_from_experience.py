@@ -67,7 +67,7 @@ async def test_a_past_pose_is_carried_over_to_an_object_that_moved_and_rotated(s
 
 
 async def test_from_a_candidate_it_can_be_picked_up_as_suggested(scene: Scene) -> None:
-    stands = [Pose([x / 10, y / 10, -0.9], yaw_quaternion(-y / 8)) for x in (-9, -7, -5) for y in (-3, 0, 3)]
+    stands = [Pose([x / 10, y / 10, -0.9], yaw_quaternion(-y / 8)) for x in range(-9, -4) for y in range(-3, 4)]
     known_poses = Known(
         *(
             past(stand, arm=arm, grasp=grasp, torso=torso)
@@ -81,7 +81,7 @@ async def test_from_a_candidate_it_can_be_picked_up_as_suggested(scene: Scene) -
     places = [place async for place in location_from(scene, known_poses)]
     assert scene.world.save_state() == before
     assert {place.grasp for place in places} == set(Grasp)
-    assert 5 < len(places) < len(known_poses.known)
+    assert 20 < len(places) < len(known_poses.known)
     for place in places:
         assert place.grasp is not None
         assert place.torso_height is not None

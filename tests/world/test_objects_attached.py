@@ -43,10 +43,21 @@ def carried(before: np.ndarray, after: np.ndarray, pose: Pose) -> np.ndarray:
     return np.asarray(after @ np.linalg.inv(before) @ matrix(pose))
 
 
-def test_two_hundred_motions_leave_the_attachment_exact(crane: Object, cup: Object) -> None:
+def test_joints_and_base_carry_a_chain_rigidly(crane: Object, cup: Object, spoon: Object) -> None:
     crane.attach(cup, "hook")
-    for step in range(200):
-        crane.set_joint_position("turning", 0.05 * step)
+    cup.attach(spoon)
+    before = crane_links(Pose(), turning=0, lifting=0, reaching=0)["hook"]
+    crane.set_joint_positions(JOINTS)
+    crane.set_pose(BASE)
+    after = crane_links(BASE, **JOINTS)["hook"]
+    np.testing.assert_allclose(matrix(cup.pose), carried(before, after, CUP_AT), atol=1e-9)
+    np.testing.assert_allclose(matrix(spoon.pose), carried(before, after, SPOON_AT), atol=1e-9)
+
+
+def test_a_thousand_motions_leave_the_attachment_exact(crane: Object, cup: Object) -> None:
+    crane.attach(cup, "hook")
+    for step in range(1000):
+        crane.set_joint_position("turning", 0.01 * step)
     crane.set_joint_position("turning", 0.0)
     np.testing.assert_allclose(matrix(cup.pose), matrix(CUP_AT), atol=1e-9)
 
@@ -104,21 +115,15 @@ def test_an_attachment_without_a_link_is_to_the_base(crane: Object, cup: Object,
     assert ("attached", "crane", "cup", None) in change_log.notes
 
 
-@pytest.mark.parametrize("moved", [None, Pose([0.9, 0.9, 0.9], yaw_quaternion(1.0))])
-def test_joints_and_base_carry_a_chain_rigidly_also_after_it_was_moved(
-    crane: Object, cup: Object, spoon: Object, moved: Pose | None
-) -> None:
+def test_an_attached_object_that_is_moved_stays_attached_at_its_new_place(crane: Object, cup: Object) -> None:
     crane.attach(cup, "hook")
-    cup.attach(spoon)
-    if moved is not None:
-        cup.set_pose(moved)
-    held = {each: each.pose for each in (cup, spoon)}
-    before = crane_links(Pose(), turning=0, lifting=0, reaching=0)["hook"]
+    moved = Pose([0.9, 0.9, 0.9], yaw_quaternion(1.0))
+    cup.set_pose(moved)
+    assert cup.attached_to is crane
     crane.set_joint_positions(JOINTS)
-    crane.set_pose(BASE)
-    after = crane_links(BASE, **JOINTS)["hook"]
-    for each, pose in held.items():
-        np.testing.assert_allclose(matrix(each.pose), carried(before, after, pose), atol=1e-9)
+    before = crane_links(Pose(), turning=0, lifting=0, reaching=0)["hook"]
+    after = crane_links(Pose(), **JOINTS)["hook"]
+    np.testing.assert_allclose(matrix(cup.pose), carried(before, after, moved), atol=1e-9)
 
 
 def test_attaching_moves_nothing_and_can_be_read_from_both_ends(
@@ -192,6 +197,12 @@ def test_removing_detaches_both_ways_first(crane: Object, cup: Object, spoon: Ob
 #
 # A bounding box encloses its object exactly, immediately after every motion.
 
+ONE_LINK = '<robot name="a"><link name="l"><collision>{origin}<geometry>{shape}</geometry></collision></link></robot>'
+
+
+def one(shape: str, origin: str = "", pose: Pose | None = None) -> Object:
+    return Object("thing", ObjectType.GENERIC_OBJECT, ONE_LINK.format(shape=shape, origin=origin), pose)
+
 
 def around(corners: list[tuple[float, float, float]], where: np.ndarray) -> np.ndarray:
     """Return the box around these points of a link that is at `where`."""
@@ -203,31 +214,35 @@ def corners(x: float, y: float, z: float) -> list[tuple[float, float, float]]:
     return [(i * x / 2, j * y / 2, k * z / 2) for i, j, k in itertools.product((-1, 1), repeat=3)]
 
 
-RIMS = [
-    (0.1 * math.cos(angle), 0.1 * math.sin(angle), end)
-    for angle in np.linspace(0, 2 * math.pi, 20_001)
-    for end in (-0.2, 0.2)
-]
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
-SHAPES = {
-    "box": ('<box size="0.2 0.4 0.6"/>', corners(0.2, 0.4, 0.6)),
-    "cylinder": ('<cylinder radius="0.1" length="0.4"/>', RIMS),
-    "mesh": ('<mesh filename="{mesh}" scale="0.1 0.1 0.1"/>', [(0, 0, 0), (0.1, 0, 0), (0, 0.2, 0), (0, 0, 0.3)]),
-}
+def test_a_box_rotated_by_45_degrees_takes_its_diagonal(world: BulletWorld) -> None:
+    body = one('<box size="0.2 0.2 0.5"/>', pose=Pose([1, 2, 3], yaw_quaternion(math.pi / 4)))
+    half = 0.1 * math.sqrt(2)
+    np.testing.assert_allclose(body.bounding_box(), [(1 - half, 2 - half, 2.75), (1 + half, 2 + half, 3.25)], atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", SHAPES)
-def test_a_tilted_shape_takes_the_space_of_its_corners_or_rims(world: BulletWorld, kind: str, tmp_path: Path) -> None:
-    mesh = tmp_path / "tetrahedron.obj"
-    mesh.write_text(TETRAHEDRON)
-    shape, points = SHAPES[kind]
-    geometry = f'<origin xyz="0.2 0 0" rpy="0.1 0 0.5"/><geometry>{shape.format(mesh=mesh)}</geometry>'
-    text = f'<robot name="a"><link name="l"><collision>{geometry}</collision></link></robot>'
-    body = Object("thing", ObjectType.GENERIC_OBJECT, text)
-    pose = Pose([1, -1, 0.5], [0.1, 0.5, -0.2, 0.7])
+def test_a_tilted_box_takes_the_space_of_its_corners(world: BulletWorld) -> None:
+    pose = Pose([0.5, -0.2, 1.0], [0.3, 0.1, -0.5, 0.6])
+    body = one('<box size="0.2 0.4 0.6"/>', '<origin xyz="0.1 0 0.3" rpy="0 0 0.3"/>')
     body.set_pose(pose)
-    where = matrix(pose) @ shifted(0.2, 0, 0) @ turned(Z, 0.5) @ turned(X, 0.1)
-    np.testing.assert_allclose(body.bounding_box(), around(points, where), atol=1e-6)
+    where = matrix(pose) @ shifted(0.1, 0, 0.3) @ turned(Z, 0.3)
+    np.testing.assert_allclose(body.bounding_box(), around(corners(0.2, 0.4, 0.6), where), atol=1e-9)
+
+
+def test_a_sphere_takes_its_radius_whatever_its_orientation(world: BulletWorld) -> None:
+    body = one('<sphere radius="0.25"/>', pose=Pose([1, 0, 0], [0.3, 0.1, -0.5, 0.6]))
+    np.testing.assert_allclose(body.bounding_box(), [(0.75, -0.25, -0.25), (1.25, 0.25, 0.25)], atol=1e-9)
+
+
+def test_a_tilted_cylinder_takes_the_space_of_its_rims(world: BulletWorld) -> None:
+    body = one('<cylinder radius="0.1" length="0.4"/>')
+    body.set_pose(Pose([0, 0, 1], [math.sin(0.3), 0, 0, math.cos(0.3)]))
+    rims = [
+        (0.1 * math.cos(angle), 0.1 * math.sin(angle), end)
+        for angle in np.linspace(0, 2 * math.pi, 20_001)
+        for end in (-0.2, 0.2)
+    ]
+    expected = around(rims, shifted(0, 0, 1) @ turned(X, 0.6))
+    np.testing.assert_allclose(body.bounding_box(), expected, atol=1e-6)
 
 
 def test_the_box_of_a_link_moves_with_joints_and_base(world: BulletWorld) -> None:
@@ -251,3 +266,41 @@ def test_a_link_without_a_shape_has_a_box_of_size_zero_at_its_frame(world: Bulle
     body = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
     at = body.link_pose("boom").position
     assert body.bounding_box("boom") == BoundingBox(at, at)
+
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+INERTIAL = (
+    '<inertial><origin xyz="0.3 0.1 0" rpy="0 0.4 1"/><mass value="1"/>'
+    '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+@pytest.mark.parametrize("inertial", ["", INERTIAL])
+def test_a_mesh_takes_the_space_of_its_corners(world: BulletWorld, tmp_path: Path, inertial: str) -> None:
+    mesh = tmp_path / "tetrahedron.obj"
+    mesh.write_text(TETRAHEDRON)
+    shape = (
+        '<collision><origin xyz="0.2 0 0" rpy="0.1 0 0.5"/><geometry>'
+        f'<mesh filename="{mesh}" scale="0.1 0.1 0.1"/></geometry></collision>'
+    )
+    body = Object("mesh", ObjectType.GENERIC_OBJECT, f'<robot name="a"><link name="l">{inertial}{shape}</link></robot>')
+    pose = Pose([1, -1, 0.5], [0.1, 0.5, -0.2, 0.7])
+    body.set_pose(pose)
+    where = matrix(pose) @ shifted(0.2, 0, 0) @ turned(Z, 0.5) @ turned(X, 0.1)
+    expected = around([(0, 0, 0), (0.1, 0, 0), (0, 0.2, 0), (0, 0, 0.3)], where)
+    np.testing.assert_allclose(body.bounding_box(), expected, atol=1e-3)
+
+
+def test_a_mesh_whose_corners_bullet_does_not_return_is_at_least_covered(world: BulletWorld, tmp_path: Path) -> None:
+    mesh = tmp_path / "tetrahedron.obj"
+    mesh.write_text(TETRAHEDRON)
+    shape = (
+        '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision><collision><geometry>'
+        f'<mesh filename="{mesh}" scale="0.1 0.1 0.1"/></geometry></collision>'
+    )
+    body = Object("mesh", ObjectType.GENERIC_OBJECT, f'<robot name="a"><link name="l">{INERTIAL}{shape}</link></robot>')
+    body.set_pose(Pose([1, 0, 0]))
+    low, high = np.array(body.bounding_box())
+    assert (low <= np.array([0.95, -0.05, -0.05])).all()
+    assert (high >= np.array([1.1, 0.2, 0.3])).all()
+    assert (high - low < np.array([0.6, 0.6, 0.6])).all()
