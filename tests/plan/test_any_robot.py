@@ -121,9 +121,10 @@ async def test_the_courier_fails_at_what_its_build_lacks(courier: Object) -> Non
     assert courier.pose == courier.original_pose
 
 
-async def test_a_head_without_a_closed_form_points_its_camera_at_the_target() -> None:
+@pytest.mark.parametrize("model", ["courier", "tiago"])
+async def test_a_head_without_a_closed_form_points_its_camera_at_the_target(model: str) -> None:
     with BulletWorld(), simulated_robot:
-        Object("tiago", ObjectType.ROBOT, robot=tiago(), pose=Pose([0.3, 0, 0]))
+        Object(model, ObjectType.ROBOT, robot=COURIER if model == "courier" else tiago(), pose=Pose([0.3, 0, 0]))
         for target in ((2, 0.5, 0.9), (1, -2, 0.8), (1.5, 1, 1.3)):
             await LookAtActionPerformable(Pose(target)).perform()
             x, y, z = Pose(target).relative_to(require_robot().camera_pose()).position
@@ -404,15 +405,29 @@ async def test_a_hand_that_is_parked_up_approaches_along_the_fingers_of_the_gras
     assert milk in tables.attachments
 
 
-async def test_a_gripper_of_a_tiago_pro_refuses_what_is_too_wide_for_it_and_a_grasp_that_it_could_not_leave(
-    tables: Object,
-) -> None:
-    """Its palm is 4 cm behind the middle of its fingers, and would still be in milk 0.2 m tall after moving back."""
+def test_the_parked_arms_of_a_tiago_pro_are_beside_its_torso_and_mirrored(tables: Object) -> None:
+    boxes = []
+    for arm in require_robot().description.arms.values():
+        links = [each for each in tables.links if arm.joints[0] in tables.joints_above(each)]
+        box = tables.body.box(links)
+        assert box is not None
+        boxes.append(
+            (box.min.x, box.max.x, min(map(abs, (box.min.y, box.max.y))), max(map(abs, (box.min.y, box.max.y))))
+        )
+    assert boxes[0] == pytest.approx(boxes[1], abs=0.01)
+    assert boxes[0] == pytest.approx((-0.07, 0.36, 0.12, 0.30), abs=0.02)
+
+
+async def test_a_gripper_of_a_tiago_pro_refuses_what_is_wider_than_its_pads_are_apart(tables: Object) -> None:
     cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.45, -0.3, 0.85]))
     await NavigateActionPerformable(Pose([0.7, -0.3, 0])).perform()
     wide = PickUpActionPerformable(cereal, Arms.RIGHT, Grasp.LEFT)
     await fails(wide, "0.148 m wide between the fingers, the RIGHT gripper opens 0.079 m")
     await PickUpActionPerformable(cereal, Arms.RIGHT, Grasp.FRONT).perform()
+
+
+async def test_a_gripper_of_a_tiago_pro_refuses_a_grasp_that_it_could_not_leave(tables: Object) -> None:
+    """Its palm is 4 cm behind the middle of its fingers, and would still be in milk 0.2 m tall after moving back."""
     milk, robot = tables.world.object("milk"), require_robot()
     await NavigateActionPerformable(Pose([0.75, 0.1, 0])).perform()
     from_above = PickUpActionPerformable(milk, Arms.LEFT, Grasp.TOP)
