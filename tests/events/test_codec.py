@@ -418,3 +418,12 @@ def test_the_first_version_of_a_declaration_has_its_original_bytes_and_name() ->
     assert encode(declared) == SAYING
     # computed with `printf %s PAYLOAD | b2sum -l 128`
     assert fingerprint(SAYING) == "998d14b09808e3a24f67631e0e367fcb"
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_every_finite_double_comes_back_bit_for_bit(value: float) -> None:
+    event = NodeEnded(1, "SUCCEEDED", result=value)
+    back = decode("NodeEnded", encode(event))
+    assert isinstance(back, NodeEnded)
+    assert math.copysign(1.0, float(back.result)) == math.copysign(1.0, value)
+    assert float(back.result) == value

@@ -38,6 +38,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Limits, Object, ObjectType, Pose
 from tests.commands import answer, pycrorm, run_script
+from tests.databases import ask_to_change
 from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
@@ -454,3 +455,31 @@ async def test_a_percept_of_another_class_is_refused_in_the_plan_and_counted(tmp
                 await perceive(Seen("cup"))  # type: ignore[arg-type]  # the fault this test is about
         await memory.flush()
         assert memory.status.faults.total == 1
+
+
+async def test_verify_names_the_event_whose_blob_is_missing_or_has_other_bytes(
+    database_url: str, tmp_path: Path
+) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory, memory.episode(description="seen"):
+        memory.observe("camera", Blob(b"one", "image/png"))
+        memory.observe("camera", Blob(b"two", "image/png"))
+    one, two = sha256(b"one").hexdigest(), sha256(b"two").hexdigest()
+    if database_url.startswith("postgresql"):
+        ask_to_change(database_url, "ALTER TABLE pycrorm.pycrorm_blob DISABLE TRIGGER USER")
+        spoil = "UPDATE pycrorm.pycrorm_blob SET content = 'owt'::bytea"
+    else:
+        ask_to_change(database_url, "DROP TRIGGER blob_is_not_updated")
+        ask_to_change(database_url, "DROP TRIGGER blob_is_not_deleted")
+        spoil = "UPDATE pycrorm_blob SET content = CAST('owt' AS BLOB)"
+    table = "pycrorm.pycrorm_blob" if database_url.startswith("postgresql") else "pycrorm_blob"
+    ask_to_change(database_url, f"DELETE FROM {table} WHERE hash = '{one}'")
+    ask_to_change(database_url, f"{spoil} WHERE hash = '{two}'")
+    result = await verified(database_url)
+    assert [str(each) for each in result.damages] == [
+        f"episode 1, event 3: refers to blob {one}, which is missing",
+        f"episode 1, event 4: refers to blob {two}, which has a content that does not match its hash",
+    ]
+    if not database_url.startswith("postgresql"):
+        done = pycrorm("verify", "--url", database_url, cwd=tmp_path)
+        assert done.returncode == 4
+        assert f"refers to blob {one}, which is missing" in done.stdout
