@@ -209,8 +209,8 @@ class CustomTables:
     ) -> bool:
         """Fold a batch of this share of each projection; return False if none was behind.
 
-        The process of another share may not have the code. So one that has folded its own share folds the others at
-        intervals, and goes on while they are far behind.
+        The process of another share may lack the code of a projection. Therefore a process that has folded its own
+        share folds a batch of the other shares every 30 s, and continues if that batch was large.
 
         Unless `until_visible` is True, checks at intervals only: the batches of the tables leave few events, those of
         the package's own projections, of which a few cost as much as a thousand.
